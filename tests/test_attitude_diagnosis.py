@@ -125,9 +125,12 @@ def test_reactions_are_the_changes_of_the_conditions(calibrated):
     windows = len(about.details.duration) // measurement.group
     for pushed, turned in ((force, zero), (zero, rate)):
         wanted = conditions(pushed, turned) - conditions(zero, zero)
-        inverses = (np.linalg.inv(np.asarray(triad.gain)) for triad in (bare.accelerometer, bare.gyroscope))
-        both = [(each @ inverse.T)[..., None] for each, inverse in zip((pushed, turned), inverses, strict=True)]
-        found = np.asarray(about.details.reactions.react(*both, windows))[:, 0]
+        added = {"accelerometer": pushed, "gyroscope": turned}
+        felt = {
+            name: (values @ np.linalg.inv(np.asarray(bare.triads()[name].gain)).T)[..., None]
+            for name, values in added.items()
+        }
+        found = np.asarray(about.details.reactions.react(felt, windows))[:, 0]
         np.testing.assert_allclose(found, wanted, atol=5e-4 * np.abs(wanted).max())
 
 
@@ -188,7 +191,8 @@ def test_noise_of_the_attitude_reaches_rotations_and_forces_alike(calibrated):
     conditions = (jax.tree.map(lambda leaf: leaf[0], each.conditions) for each in (before, after))
     plain, changed = (np.asarray(each(imu.with_effects())) for each in conditions)
     at = np.asarray(measurement.intervals.stamp)
-    wanted = np.asarray(before.covariance.factors[1])[0] / 1e-3 @ wrong(at).ravel()
+    reach = jax.tree.map(lambda leaf: leaf[0], before.covariance.factors[1])
+    wanted = np.asarray(reach.times(wrong(at).reshape(-1, 1) / 1e-3, len(plain)))[:, 0]
     turns = 3 * len(measurement.intervals.used)
     for part in (slice(turns), slice(turns, None)):
         np.testing.assert_allclose((changed - plain)[part], wanted[part], atol=2e-3 * np.abs(wanted[part]).max())

@@ -93,13 +93,14 @@ def calibrate_against_attitude(
     loss: Loss = "linear",
     repair: bool = False,
     unit: Imu | None = None,
+    excess: Mapping[str, float] | None = None,
 ) -> tuple[Calibration, AgainstAttitude]:
     """Calibrate a unit against a measured attitude; how the reference is mounted, and late, is estimated with it.
 
     **Arguments:** `recording`: accelerometer and gyroscope; `attitude`: on its own stamps, counted from
     `recording.start` where both are absolute; `gravity`, `static`, `effects`, `effect_sigmas`, `loss`, `repair` as
     for [`jaximu.calibrate`]; `unit`: to keep its gains and effects, so that its biases alone, and how the reference is
-    mounted, are estimated.
+    mounted, are estimated; `excess`: of the noise, by name, where a fit before tells about what it is.
 
     **Returns:** the calibration, in axes in which the accelerometer's gain is lower triangular, and what it was fitted
     to. Its `reference` has rotation, time offset, clock scale and what stays open.
@@ -122,7 +123,8 @@ def calibrate_against_attitude(
         def free(name: Name) -> bool:
             return without_equipment_or_effects(name) if unit is None else name.part == "bias" or of_setup(name)
 
-        fitted = fit(imu, measurement, free, prior=prior, loss=loss)
+        near = None if excess is None else [excess[name] for name in EXCESS_NAMES]
+        fitted = fit(imu, measurement, free, prior=prior, loss=loss, excess=near)
         require_determined(fitted, recording.name, f"{attitude.name} shows too few turns, which", _RECORD, prior)
     calibration = concluded(
         fitted,
@@ -350,7 +352,7 @@ def _right_handed(recording: Recording, start: _Start) -> Attitude:
     force = Integral(recording.accelerometer)
     rows = rows[(inside > force.edges[0]) & (inside < force.edges[-1])]
     inner = np.linspace(attitude.time[rows[:-1]], attitude.time[rows[1:]], 9, axis=1)
-    stood = scipy.spatial.transform.Slerp(attitude.time, attitude.rotation())(inner[:, 1:].ravel())
+    stood = attitude.at(inner[:, 1:].ravel())
     parts = force.over(inner[:, :-1] - start.delay, inner[:, 1:] - start.delay).reshape(-1, 3) @ start.matrix
     felt = stood.apply(parts).reshape(len(inner), -1, 3).sum(axis=1)
     gained = np.diff(velocity[rows], axis=0)
@@ -491,8 +493,7 @@ def _in_common(recording: Recording, attitude: Attitude, delay: float) -> tuple[
     if len(unit) < 16:
         return None
     force = interpolated(recording.accelerometer.time, _smooth(recording), time)
-    known = scipy.spatial.transform.Slerp(attitude.time, attitude.rotation())(time + delay)
-    up = known.inv().apply([0.0, 0.0, 1.0])
+    up = attitude.at(time + delay).inv().apply([0.0, 0.0, 1.0])
     return unit - unit.mean(axis=0), reference - reference.mean(axis=0), force, up
 
 

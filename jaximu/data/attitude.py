@@ -8,7 +8,7 @@ the change of velocity over the time, known where the reference has velocities, 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -17,18 +17,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from jaxtyping import Bool, Float, Int
 
 from jaximu.data.preintegration import increments, linear_slope, preintegrate_samples, white_covariance
-from jaximu.estimation.covariance import Covariance
+from jaximu.estimation.covariance import BlockFactor, Covariance
 from jaximu.estimation.data import About, Conditions, Observed, OfOneUnit, free_columns
 from jaximu.estimation.problem import Parameters
 from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, Sizes, by_axis
 from jaximu.estimation.track import TRIADS, Track, added, stimuli
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray, IntArray
-from jaximu.ground.differences import interpolated, midpoints, value_and_jacobian
+from jaximu.ground.differences import interpolated, midpoints
 from jaximu.ground.rotation import (
     UP,
     Number,
@@ -42,7 +41,7 @@ from jaximu.ground.rotation import (
     rotation_matrix,
     unit_vectors,
 )
-from jaximu.ground.tracing import padded_size
+from jaximu.ground.tracing import array_module
 from jaximu.model.effects import Effect
 from jaximu.model.effects.reference_filter import behind
 from jaximu.model.mounting import MOUNTING_EFFECTS, Mounting
@@ -67,7 +66,7 @@ WINDOW, _WITH_VELOCITY = 2.0, 1.0
 """Seconds of a window of the specific force: long where changes of velocity are to average out, shorter where they are
 known, as few windows cannot tell their noise from what an accelerometer does wrong. With windows of 0.5 s intervals
 came out a tenth too small in recordings of 30 s, which show too little of the noise that does not average out."""
-_MARGIN = 3
+_MARGIN, _BUCKET = 3, 32
 _SMOOTH = 0.05
 """Seconds over which the slope of the rate is taken."""
 _MOVING = ("delay", "clock_scale")
@@ -109,24 +108,28 @@ class AttitudeConditions(Conditions):
 
 
 class Reactions(eqx.Module):
-    """How an interval's rotation and its part of a window's mean force react to rate and force of its samples, in SI.
+    """How an interval's rotation and its part of a window's mean force react to the samples of a triad, in SI.
 
-    sample: their places.
+    by_triad: all samples' axes in a row, which makes the reaction one product. sample: their places.
     """
 
-    reaction: Float[Array, "T S 6 6"]
+    by_triad: dict[str, Float[Array, "T 6 3*S"]]
     sample: Int[Array, "T S"]
 
-    def react(self, force: Float[Array, "m 3 k"], rate: Float[Array, "m 3 k"], windows: int) -> Float[Array, "n k"]:
-        """Return how the conditions react to additions to the specific force and to the rate at every sample."""
-        return self.react_inside(jnp.concatenate([rate, force], axis=1)[self.sample], windows)
+    def react(self, changes: Mapping[str, Float[Array, "m 3 k"]], windows: int) -> Float[Array, "n k"]:
+        """Return how the conditions react to additions to every sample of triads."""
+        return self.react_inside({name: change[self.sample] for name, change in changes.items()}, windows)
 
-    def react_inside(self, changes: Float[Array, "T S 6 k"], windows: int) -> Float[Array, "n k"]:
-        """Return how they react to additions to rate and force at the samples of each interval."""
-        both = jnp.einsum("tsij,tsjk->tik", self.reaction, changes)
+    def react_inside(self, changes: Mapping[str, Float[Array, "T S 3 k"]], windows: int) -> Float[Array, "n k"]:
+        """Return how they react to additions to triads at the samples of each interval."""
+        numerics = array_module(self, changes)
+        rows = {
+            name: change.reshape(len(change), 3 * change.shape[1], change.shape[-1]) for name, change in changes.items()
+        }
+        both = numerics.sum(numerics.stack([self.by_triad[name] @ change for name, change in rows.items()]), axis=0)
         turned, pushed = both[:, :3], both[:, 3:]
-        summed = jnp.sum(pushed.reshape(windows, len(pushed) // windows, *pushed.shape[1:]), axis=1)
-        return jnp.concatenate([turned, summed]).reshape(3 * (len(turned) + windows), both.shape[-1])
+        summed = pushed.reshape(windows, len(pushed) // windows, *pushed.shape[1:]).sum(axis=1)
+        return numerics.concatenate([turned, summed]).reshape(3 * (len(turned) + windows), both.shape[-1])
 
 
 @dataclass(frozen=True)
@@ -271,18 +274,34 @@ def evaluated(
     leaning = share @ jnp.cross(jnp.eye(3), whole.velocity[:, None]).swapaxes(1, 2)
     turned = whole.reaction[..., :3, :] * data.used[:, None, None, None]
     reaction = jnp.concatenate([turned, share[:, None] @ whole.reaction[..., 3:6, :]], axis=-2)
-    return conditions, spread, duration, leaning, Reactions(reaction, samples)
+    by_triad = {
+        name: part.swapaxes(1, 2).reshape(len(samples), 6, -1)
+        for name, part in zip(reversed(TRIADS), jnp.split(reaction, 2, axis=-1), strict=True)
+    }
+    return conditions, spread, duration, leaning, Reactions(by_triad, samples)
 
 
-def shared_ends(back: Float[Array, "T 3 3"]) -> Float[Array, "3*T 3*(T+1)"]:
-    """Return how the errors (rad) of T + 1 attitudes in a row, each in its body's frame, enter the rotations between.
+def shared_ends(back: Float[Array, "T 3 3"], leaning: Float[Array, "T 3 3"], windows: int) -> BlockFactor:
+    """Return how errors (rad) of T + 1 attitudes in a row, each in its body's frame, enter rotations and mean forces.
 
-    **Arguments:** `back`: from the frame at an interval's start to that at its end.
+    Neighbouring intervals share an end, and where the reference stands wrong there the force of the window leans.
+
+    **Arguments:** `back`: from the frame at an interval's start to that at its end. `leaning`: of the window's force.
     """
-    count, one = len(back), np.eye(3)
-    later = np.eye(count, count + 1, 1)[:, None, :, None] * one[None, :, None, :]
-    earlier = np.eye(count, count + 1)[:, None, :, None] * back[:, :, None, :]
-    return (earlier - later).reshape(3 * count, 3 * (count + 1))
+    count = len(back)
+    rotation = np.arange(3 * count).reshape(count, 3)
+    force = 3 * count + 3 * (np.arange(count) * windows // count)[:, None] + np.arange(3)
+    ends = -np.broadcast_to(np.eye(3), back.shape)
+    return _of_ends([(rotation, ends)], [(rotation, back), (force, leaning)])
+
+
+def _of_ends(ends: Sequence[tuple[IntArray, Array]], starts: Sequence[tuple[IntArray, Array]]) -> BlockFactor:
+    """Return how T + 1 errors in a row enter rows (T, 3) of the T intervals between, as their ends and as starts."""
+    parts, beside = [*ends, *starts], [(1, 0)] * len(ends) + [(0, 1)] * len(starts)
+    rows = [np.pad(rows, (there, (0, 0)), mode="edge") for (rows, _), there in zip(parts, beside, strict=True)]
+    numerics = array_module([values for _, values in parts])
+    values = [numerics.pad(part, (there, (0, 0), (0, 0))) for (_, part), there in zip(parts, beside, strict=True)]
+    return BlockFactor(np.concatenate(rows, axis=1), numerics.concatenate(values, axis=1))
 
 
 @dataclass(frozen=True)
@@ -358,7 +377,7 @@ class AgainstAttitude(OfOneUnit):
         stamps = mounting.on_log(data.stamp)
         first = np.searchsorted(data.until, stamps[:-1]) - _MARGIN
         longest = np.searchsorted(data.until, stamps[1:]) - first + _MARGIN
-        size = padded_size(int(longest[data.used].max()))
+        size = -(-int(longest[data.used].max()) // _BUCKET) * _BUCKET
         return np.clip(first[:, None] + np.arange(size), 0, len(data.until) - 1)
 
     def unsmoothed(self, imu: Imu) -> Attitude:
@@ -389,11 +408,9 @@ class AgainstAttitude(OfOneUnit):
         """Return what the unit went through at the gyroscope's samples as it measured it, standing as was measured."""
         known = stimuli(self.recording, imu)["gyroscope"]
         mounting = Mounting.of(imu)
-        time = self.attitude.time + self.offset
-        stamps = np.clip(mounting.on_reference(np.asarray(known.time)), *time[[0, -1]])
-        stood = scipy.spatial.transform.Slerp(time, self.attitude.rotation())(stamps)
-        stood = stood * scipy.spatial.transform.Rotation.from_rotvec(np.array(mounting.rotation))
-        return replace(known, attitude=stood.as_quat(scalar_first=True))
+        stamps = mounting.on_reference(np.asarray(known.time)) - self.offset
+        stood = self.attitude.at(np.clip(stamps, *self.attitude.time[[0, -1]])).as_quat(scalar_first=True)
+        return replace(known, attitude=np.asarray(multiply(stood, mounting.turned)))
 
     def rows(self, imu: Imu) -> Rows:
         """Return what each condition is: three of each rotation, then three of each window's mean force."""
@@ -446,9 +463,9 @@ class AgainstAttitude(OfOneUnit):
             def bent(change):  # coning and sculling change with it
                 return increments(rates, change, held)[1] / jnp.where(held > 0, held, 1.0)[..., None]
 
-            changes = [inverse_matrix(triads[name].gain) @ slopes[name] for name in reversed(TRIADS)]
-            changes = [jax.vmap(bent, -1, -1)(change[reactions.sample]) for change in changes]
-            columns = -reactions.react_inside(jnp.concatenate(changes, axis=2), len(conditions.window))
+            changes = {name: inverse_matrix(triads[name].gain) @ slopes[name] for name in TRIADS}
+            inside = {name: jax.vmap(bent, -1, -1)(change[reactions.sample]) for name, change in changes.items()}
+            columns = -reactions.react_inside(inside, len(conditions.window))
             turns = 3 * len(conditions.turn)
             error = conditions(imu)[:turns].reshape(-1, 3)
             turned = jnp.linalg.solve(right_jacobian(error), columns[:turns].reshape(*error.shape, columns.shape[1]))
@@ -458,7 +475,7 @@ class AgainstAttitude(OfOneUnit):
             compute, f"against attitude {group}", bare, mounting, data, self._places(mounting), noise, quick=False
         )
         columns = stored.call(
-            by_samples, "against attitude by samples", bare, mounting, data, conditions, reactions, slopes
+            by_samples, "against attitude by samples", bare, mounting, data, conditions, reactions, slopes, quick=False
         )
         kinds: list[type[Effect]] = [*MOUNTING_EFFECTS]
         by_kind = {kind: by_mounting[field] for kind, field in zip(kinds, Mounting._fields, strict=True)}
@@ -485,13 +502,15 @@ class AgainstAttitude(OfOneUnit):
             return data, dict.fromkeys(TRIADS, np.zeros((*data.rate.shape, 0)))
 
         def compute(imu, parameters, data, around):
-            return value_and_jacobian(
-                lambda z: _added(parameters.model(imu, z), data, around), jnp.zeros(len(parameters.index))
-            )
+            count = len(parameters.index)
+            outputs, push = jax.linearize(lambda z: _added(parameters.model(imu, z), data, around), jnp.zeros(count))
+            slopes = jax.lax.map(push, jnp.diag(1 / parameters.size))  # one by one they stay in the processor's cache
+            return outputs, {name: jnp.moveaxis(slope, 0, -1) for name, slope in slopes.items()}
 
-        outputs, slopes = stored.call(compute, "added against attitude", adding, parameters, data, self.around(imu))
+        outputs, slopes = stored.call(
+            compute, "added against attitude", adding, parameters, data, self.around(imu), quick=False
+        )
         force, rate = (values - outputs[name] for name, values in zip(TRIADS, (data.force, data.rate), strict=True))
-        slopes = {name: slope / parameters.size for name, slope in slopes.items()}
         return eqx.tree_at(lambda data: (data.force, data.rate), data, (force, rate)), slopes
 
     def reactions(self, details: AttitudeDetails):
@@ -500,9 +519,10 @@ class AgainstAttitude(OfOneUnit):
 
         def of(effect, imu, part):
             tracks, reactions = part
-            outputs, triads = added(imu.with_effects(effect), tracks), imu.triads()
-            force, rate = ((outputs[name] @ inverse_matrix(triads[name].gain).T)[..., None] for name in TRIADS)
-            return reactions.react(force, rate, windows)[:, 0]
+            acting = {name: track for name, track in tracks.items() if effect.owner in (name, "setup")}
+            outputs, triads = added(imu.with_effects(effect), acting), imu.triads()
+            felt = {name: (values @ inverse_matrix(triads[name].gain).T)[..., None] for name, values in outputs.items()}
+            return reactions.react(felt, windows)[:, 0]
 
         return f"against attitude {windows}", of, [(tracks, details.reactions) for tracks in details.tracks]
 
@@ -530,9 +550,7 @@ class AgainstAttitude(OfOneUnit):
 
         def react(triad: str, shape: FloatArray) -> FloatArray:
             along = np.einsum("ij,mk->mijk", np.eye(3), shape).reshape(len(shape), 3, -1)
-            none = np.zeros_like(along)
-            both = (along, none) if triad == "accelerometer" else (none, along)
-            return np.asarray(details.reactions.react(*both, windows))
+            return np.asarray(details.reactions.react({triad: along}, windows))
 
         share = (np.asarray(stimulus.time) - stamps[0]) / np.ptp(stamps)
         return Observed(react, share, up=unit_vectors(force))
@@ -549,10 +567,7 @@ class AgainstAttitude(OfOneUnit):
     def _covariance(
         self, conditions, spread: FloatArray, duration: FloatArray, leaning: FloatArray, white: float
     ) -> Covariance:
-        """White noise that is known, and the components of what is not.
-
-        Neighbouring intervals share an end, and where the reference stands wrong there the force of the window leans.
-        """
+        """White noise that is known, and the components of what is not."""
         turn, window = conditions.turn, conditions.window
         turns, windows = len(turn), len(window)
         total = duration.reshape(windows, -1).sum(axis=1)
@@ -570,22 +585,17 @@ class AgainstAttitude(OfOneUnit):
             whole[rows.ravel()] = factor
             return (whole.T * used).T
 
-        back = rotation_matrix(conditions.target).swapaxes(1, 2)
-        ends = np.zeros((n, 3 * (turns + 1)))
-        ends[rows.ravel()] = shared_ends(back)
-        for interval in range(turns):
-            ends[later[interval * windows // turns], 3 * interval : 3 * interval + 3] = leaning[interval]
+        back = np.asarray(rotation_matrix(conditions.target)).swapaxes(1, 2)
         step = np.sqrt(np.maximum(duration, 0.0))
         walk = np.kron(np.tril(np.ones((turns, turns))) * step * duration[:, None], np.eye(3))
-        changes = np.kron((np.eye(windows + 1)[1:] - np.eye(windows + 1)[:-1]) / total[:, None], np.eye(3))
+        mean = np.eye(3) / total[:, None, None]
         factors = (
-            placed(rows, np.repeat(step, 3)),
-            (ends.T * used).T,
-            placed(rows, walk),
-            placed(later, np.repeat(total**-0.5, 3)),
-            placed(later, changes),
+            placed(rows, np.repeat(step, 3)) * _UNITS[0],
+            shared_ends(back, leaning, windows).of_rows(_UNITS[1] * used),
+            placed(rows, walk) * _UNITS[2],
+            placed(later, np.repeat(total**-0.5, 3)) * _UNITS[3],
+            _of_ends([(later, mean)], [(later, -mean)]).of_rows(_UNITS[4] * used),
         )
-        factors = tuple(factor * unit for factor, unit in zip(factors, _UNITS, strict=True))
         return Covariance(measured, factors, used, np.repeat([0, 3], [3 * turns, 3 * windows]))
 
     def errors(self, imu: Imu) -> dict[str, tuple[FloatArray, FloatArray, str]]:

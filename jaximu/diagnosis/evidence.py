@@ -383,12 +383,12 @@ def _grid_limit(gram: FloatArray, lengths: FloatArray, places: int, level: float
     direction = random.standard_normal((_DRAWN, columns.shape[1]))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     signal = np.concatenate([direction[k::places] @ gram[columns[k]] for k in range(places)])
-    n, v = (np.einsum("dkq,kqr->dkr", drawn.reshape(_DRAWN, *columns.shape), root) for drawn in (noise, signal))
-    lacking, across, strength = bound - np.sum(n**2, axis=2), np.sum(n * v, axis=2), np.sum(v**2, axis=2)
+    n, v = (drawn.reshape(_DRAWN, *columns.shape).swapaxes(0, 1) @ root for drawn in (noise, signal))
+    lacking, across, strength = bound[:, None] - np.sum(n**2, axis=2), np.sum(n * v, axis=2), np.sum(v**2, axis=2)
     with np.errstate(divide="ignore", invalid="ignore"):
         needed = (np.sqrt(across**2 + strength * lacking) - across) / strength
     needed = np.where(lacking <= 0, 0.0, np.where(np.isfinite(needed), needed, np.inf))
-    return float(np.sort(needed.min(axis=1))[int(LIMIT_POWER * _DRAWN)])
+    return float(np.sort(needed.min(axis=0))[int(LIMIT_POWER * _DRAWN)])
 
 
 @lru_cache(maxsize=64)

@@ -389,7 +389,8 @@ class Experiment(Data):
                 f"{CATALOGUE[name].excited_by}"
             )
         limits = {name: limit for name, limit in limits.items() if name not in blind}
-        evidence = Evidence(whole.residual, jacobian, visible, noise)
+        same = noise is None and len(visible) == len(blocks)
+        evidence = whole if same else Evidence(whole.residual, jacobian, visible, noise)
         return State(
             model, linear.names, covariance, evidence, linear.conditions[used], weights, limits, blind, linear, prior
         )

@@ -6,7 +6,7 @@ component of the excess is a variance, in multiples of a mean measured covarianc
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations_with_replacement, pairwise
 from math import prod
 from typing import ClassVar
 
@@ -157,9 +157,14 @@ class Covariance(eqx.Module):
             return squares @ jnp.diagonal(inverse), squares @ inverse**2 @ squares.T
 
         beside = [_transposed(factor, inverse).T for factor in self.factors]  # C⁻¹ F_i
-        entries = [[_transposed(factor, other) for other in beside] for factor in self.factors]
-        first = jnp.stack([jnp.trace(row[k]) for k, row in enumerate(entries)])
-        return first, jnp.array([[jnp.sum(entry**2) for entry in row] for row in entries])
+        first, second = jnp.zeros(len(beside)), jnp.zeros((len(beside),) * 2)
+        # the wider of two factors first: it is diagonal, and its product next to nothing
+        order = sorted(range(len(beside)), key=lambda k: -beside[k].shape[1])
+        for i, j in combinations_with_replacement(order, 2):
+            entry = _transposed(self.factors[i], beside[j])
+            first = first.at[i].set(jnp.trace(entry)) if i == j else first
+            second = second.at[jnp.array([i, j]), jnp.array([j, i])].set(jnp.sum(entry**2))
+        return first, second
 
 
 class ChainWeights(eqx.Module):

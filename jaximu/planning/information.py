@@ -294,19 +294,12 @@ def robot_information(
 
     size = known + len(sizes)
     jacobian, (spread, length, leaning, target) = jax.jacfwd(found, has_aux=True)(jnp.zeros(size))
-    interval, window = jnp.arange(count), jnp.arange(count // group)
-    rotation, force = 3 * interval[:, None] + jnp.arange(3), 3 * count + 3 * window[:, None] + jnp.arange(3)
-    # where the robot's report is wrong at an interval's start, both neighbours are, and the window's force leans
-    ends = (
-        jnp.zeros((len(jacobian), 3 * (count + 1)))
-        .at[: 3 * count]
-        .set(shared_ends(rotation_matrix(target).swapaxes(1, 2)))
-    )
-    ends = accuracy.attitude * ends.at[force[interval // group][:, :, None], rotation[:, None, :]].set(leaning)
+    rotation, force = jnp.split(jnp.arange(len(jacobian)).reshape(-1, 3), [count])
+    ends = shared_ends(rotation_matrix(target).swapaxes(1, 2), leaning, count // group)
     inverse = unit.accelerometer.inverse()[:, :3]
     density = (1 + accuracy.excess[0]) * jnp.trace(inverse @ accuracy.accelerometer @ inverse.T) / 3 * accuracy.rest
     felt = (density / length.reshape(-1, group).sum(axis=1))[:, None, None] * jnp.eye(3)
-    noise = ends @ ends.T
+    noise = accuracy.attitude**2 * ends.component(len(jacobian))
     for rows, white in ((rotation, (1 + accuracy.excess[1]) * spread), (force, felt)):
         noise = noise.at[rows[:, :, None], rows[:, None, :]].add(white)
     whole = _information(noise, jacobian)

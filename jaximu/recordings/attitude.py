@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy
@@ -58,6 +59,11 @@ class Attitude:
     def rotation(self) -> scipy.spatial.transform.Rotation:
         """Return the rotations from the body to the upright frame."""
         return scipy.spatial.transform.Rotation.from_quat(self.quaternion, scalar_first=True)
+
+    @cached_property
+    def at(self) -> scipy.spatial.transform.Slerp:
+        """Return, of times (m,) between the first stamp and the last, the rotations from body to upright frame."""
+        return scipy.spatial.transform.Slerp(self.time, self.rotation())
 
     def turned(self) -> FloatArray:
         """Return the rotation vector (n − 1, 3), body frame, from each stamp to the next; NaN over a jump."""
