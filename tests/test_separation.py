@@ -7,6 +7,7 @@ import pytest
 import scipy.stats
 
 from jaximu.diagnosis import diagnose
+from jaximu.diagnosis.diagnosis import Option
 from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
 from jaximu.noise.at_rest import fit_noise
@@ -55,6 +56,21 @@ def test_a_cycle_of_temperature_tells_temperature_from_time(tied, noise, monkeyp
     recording, _ = simulate(unit, HandHeld(POSES), consumer_noise(), seed=5, environment=environment)
     (named,) = diagnose(recording, static=noise).effects
     assert "accel.temperature" in {named.name, *named.rivals} and "accel.bias_ramp" not in {named.name, *named.rivals}
+
+
+@pytest.mark.parametrize(("power", "heeded"), [(0.994, False), (0.2, False), (1.0, True)])
+def test_a_recording_that_shows_no_more_than_this_one_is_not_advised(tied, monkeypatch, power, heeded):
+    """Measured: "That would show it with 100 % probability; this recording, with 100 %"."""
+
+    def made(diagnosis, cause):
+        return (
+            Option("record 40 poses by hand", dict.fromkeys(cause.rivals, power), dict.fromkeys(cause.rivals, 0.99)),
+        )
+
+    monkeypatch.setattr(separation, "options", made)
+    advice = advised(tied)
+    assert (advice.suggestion != tied.suggestion) == heeded
+    assert len(advice.options) == 1
 
 
 def test_the_power_is_that_of_the_score_test(tied):

@@ -192,6 +192,11 @@ class Option:
         """The rivals that it tells apart with 90 % power."""
         return [name for name, power in self.powers.items() if power >= LIMIT_POWER]
 
+    @property
+    def better(self) -> bool:
+        """Whether it shows more than the recording that was diagnosed, by a percent at least, as both are stated."""
+        return any(round(100 * power) > round(100 * self.before[name]) for name, power in self.powers.items())
+
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Diagnosis(Result, Document, page="diagnosis"):

@@ -60,6 +60,7 @@ def advised(diagnosis: Diagnosis) -> Diagnosis:
     """Return a diagnosis that says what would settle its first cause with rivals, or else its first weak one.
 
     Where a set-up's own error is the cause or a rival it is left as it is: no recording that is tried here shows one.
+    So it is where none would show more than this recording does.
     """
     unsettled = [cause for cause in diagnosis.named if cause.rivals] or [
         cause for cause in diagnosis.named if cause.weak
@@ -69,7 +70,9 @@ def advised(diagnosis: Diagnosis) -> Diagnosis:
         return diagnosis
     cause = unsettled[0]
     candidates = options(diagnosis, cause)
-    return replace(diagnosis, suggestion=suggestion(cause, candidates), options=candidates)
+    better = [option for option in candidates if option.better]
+    words = suggestion(cause, better) if better else diagnosis.suggestion
+    return replace(diagnosis, suggestion=words, options=candidates)
 
 
 def suggestion(cause: Named, candidates: Sequence[Option]) -> str:
