@@ -93,14 +93,13 @@ def calibrate_against_attitude(
     loss: Loss = "linear",
     repair: bool = False,
     unit: Imu | None = None,
-    excess: Mapping[str, float] | None = None,
 ) -> tuple[Calibration, AgainstAttitude]:
     """Calibrate a unit against a measured attitude; how the reference is mounted, and late, is estimated with it.
 
     **Arguments:** `recording`: accelerometer and gyroscope; `attitude`: on its own stamps, counted from
     `recording.start` where both are absolute; `gravity`, `static`, `effects`, `effect_sigmas`, `loss`, `repair` as
     for [`jaximu.calibrate`]; `unit`: to keep its gains and effects, so that its biases alone, and how the reference is
-    mounted, are estimated; `excess`: of the noise, by name, where a fit before tells about what it is.
+    mounted, are estimated.
 
     **Returns:** the calibration, in axes in which the accelerometer's gain is lower triangular, and what it was fitted
     to. Its `reference` has rotation, time offset, clock scale and what stays open.
@@ -123,8 +122,7 @@ def calibrate_against_attitude(
         def free(name: Name) -> bool:
             return without_equipment_or_effects(name) if unit is None else name.part == "bias" or of_setup(name)
 
-        near = None if excess is None else [excess[name] for name in EXCESS_NAMES]
-        fitted = fit(imu, measurement, free, prior=prior, loss=loss, excess=near)
+        fitted = fit(imu, measurement, free, prior=prior, loss=loss)
         require_determined(fitted, recording.name, f"{attitude.name} shows too few turns, which", _RECORD, prior)
     calibration = concluded(
         fitted,

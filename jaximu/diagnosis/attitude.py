@@ -38,7 +38,7 @@ def diagnose_against_attitude(
         calibration,
         measurement,
         noise,
-        lambda effects: calibrated(effects=effects, excess=calibration.excess)[0],
+        lambda effects: calibrated(effects=effects)[0],
         findings=tuple(inspect(recording)),
         notes=calibration.notes,
         level=level,
