@@ -532,6 +532,8 @@ def test_a_simulated_magnetometer_is_calibrated(tmp_path, capsys):
     field = 49
     dip = 66
     current = [[0, 0], [60, 3]]
+    [accelerometer]
+    scale = { mean = 0.02, sigma = 0.001 }
     [magnetometer]
     bias = [12, "-30 uT", 5]
     scale = { mean = 0, sigma = 0.05 }
@@ -545,8 +547,12 @@ def test_a_simulated_magnetometer_is_calibrated(tmp_path, capsys):
     assert main(["simulate", str(tmp_path / "spec.toml"), "-o", str(tmp_path / "log.csv")]) == 0
     truth = json.loads((tmp_path / "log.csv.truth.json").read_text())
     capsys.readouterr()
-    assert main(["magnetometer", str(tmp_path / "log.csv"), "--field", "49", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    out = tmp_path / "out"
+    assert main(["magnetometer", str(tmp_path / "log.csv"), "--field", "49", "-o", str(out)]) == 0
+    printed, found = capsys.readouterr().out, json.loads((out / "calibration.json").read_text())
+    # scales are compared with the data sheet's, and not with those of the calibration that came before
+    scales = printed.partition("scale x")[2].partition("misalignment")[0]
+    assert scales.count("% from nominal") == 3 and scales.count("+1.") + scales.count("+2.") == 3
     assert np.linalg.norm(truth["magnetic_field"]) == pytest.approx(49.0)
     assert found["field"]["dip"]["value"] == pytest.approx(66.0, abs=0.3)
     np.testing.assert_allclose(found["magnetometer"]["bias"], [12, -30, 5], atol=0.3)

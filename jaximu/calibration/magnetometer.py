@@ -254,7 +254,7 @@ def _calibrated(
         excess_names=EXCESS_NAMES,
         rms=[{"field_strength": (_spread(imu, windows, known), "uT")} for imu in (start, fit.imu)],
         data=_data(logs, windows),
-        nominal=start,
+        nominal=Imu.nominal() if logs[0].recording is None else as_stated(logs[0].recording),
         advice=field_advice,
         notes=[*notes_of(*logs), *notes],
         reading=next(filter(None, readings), None if base is None else base.reading),

@@ -20,7 +20,7 @@ from jaximu.estimation.uncertainty import UNDETERMINED
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import Vector
-from jaximu.ground.vectors import sigmas_of
+from jaximu.ground.vectors import root_or_zero, variances_of
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 
@@ -39,7 +39,7 @@ class OutputUncertainty:
     @property
     def sigma(self) -> FloatArray:
         """The standard deviation of each axis (..., 3); infinite where the data say no more than the data sheet."""
-        sigma = sigmas_of(self.covariance)
+        sigma = root_or_zero(variances_of(self.covariance))  # exact data leave rounding beside zero
         return np.where(sigma > UNDETERMINED * self.expected, np.inf, sigma)
 
     @property
