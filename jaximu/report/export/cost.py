@@ -90,15 +90,15 @@ class Range:
 
     def _stimulus(self, time, force, rate, acceleration, temperature, slope) -> Stimulus:
         return Stimulus(
-            np.array(force),
-            np.array(rate),
-            np.array(acceleration),
-            np.array(temperature),
-            np.array(slope),
+            force,
+            rate,
+            acceleration,
+            temperature,
+            slope,
             time,
-            np.array(np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(time), 4))),
+            np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1)),
             np.full(len(time), self.vibration),
-            (self.field or 0.0) / self.gravity * np.array(force),
+            (self.field or 0.0) / self.gravity * force,
             self.current * np.sin(0.4 * np.arange(len(time))),
         )
 
@@ -116,12 +116,11 @@ class Loss:
 
     def text(self) -> str:
         """The loss as one line."""
-        pairs = [(name, worst, self.rms[name]) for name, worst in self.worst.items()]
         costs = [
             f"{size(worst, SENSOR_UNITS[name])} at worst, {size(rms, SENSOR_UNITS[name])} rms"
             if worst is not None and rms is not None
             else f"the {name} is not determined"
-            for name, worst, rms in pairs
+            for (name, worst), rms in zip(self.worst.items(), self.rms.values(), strict=True)
             if worst != 0
         ]
         return f"{self.what}: {'; '.join(costs) or 'costs nothing here'}"
@@ -196,22 +195,21 @@ def _gap(
     return np.concatenate(gaps)
 
 
-def _loss(what: str, gaps: dict[str, FloatArray]) -> Loss:
-    lengths = {name: np.linalg.norm(gap, axis=1) for name, gap in gaps.items()}
+def _loss(what: str, errors: dict[str, FloatArray]) -> Loss:
+    """The greatest and rms length of errors (..., 3); None where one of them is not finite."""
+    lengths = {name: np.linalg.norm(error, axis=-1) for name, error in errors.items()}
+    known = {name: bool(np.isfinite(length).all()) for name, length in lengths.items()}
     return Loss(
         what,
-        {name: float(length.max()) for name, length in lengths.items()},
-        {name: float(np.sqrt(np.mean(length**2))) for name, length in lengths.items()},
+        {name: float(length.max()) if known[name] else None for name, length in lengths.items()},
+        {name: float(np.sqrt(np.mean(length**2))) if known[name] else None for name, length in lengths.items()},
     )
 
 
 def _uncertainty(calibration: Calibration, extent: Range) -> Loss:
     """The standard deviation of corrected values (the length of their vector) over the range."""
-    worst, rms = {}, {}
-    uncertainties = [calibration.uncertainty_of(path) for path in extent.paths()]
-    for name in uncertainties[0]:
-        lengths = np.linalg.norm([uncertainty[name].sigma for uncertainty in uncertainties], axis=-1)
-        determined = bool(np.isfinite(lengths).all())
-        worst[name] = float(lengths.max()) if determined else None
-        rms[name] = float(np.sqrt(np.mean(lengths**2))) if determined else None
-    return Loss("the uncertainty (1 sigma of corrected values; not an error of the file)", worst, rms)
+    still, moving = (calibration.uncertainty_of(path) for path in extent.paths())
+    return _loss(
+        "the uncertainty (1 sigma of corrected values; not an error of the file)",
+        {name: np.stack([uncertainty.sigma, moving[name].sigma]) for name, uncertainty in still.items()},
+    )

@@ -28,12 +28,12 @@ def write(parameters: ExportedUnit) -> Written:
     equation, made = [], {}
     for name, triad in parameters.triads.items():
         inverse, offset = triad.inverse, triad.bias
+        unit, factor = _FED.get(name, ("uT", 1.0))
+        lines.append(f"// {name}: y in {triad.unit}, the answer in {unit}")
         if name in _FED:
-            unit, factor = _FED[name]
             sensitivity = np.diagonal(inverse) * factor
             misalignment = inverse * factor / sensitivity
             lines += [
-                f"// {name}: y in {triad.unit}, the answer in {unit}",
                 _matrix(f"{name}Misalignment", misalignment),
                 _vector(f"{name}Sensitivity", sensitivity),
                 _vector(f"{name}Offset", offset),
@@ -45,12 +45,7 @@ def write(parameters: ExportedUnit) -> Written:
             )
             made[name] = Correction(misalignment * sensitivity / factor, offset)
         else:
-            lines += [
-                f"// {name}: y in {triad.unit}, the answer in uT",
-                _matrix("softIronMatrix", inverse),
-                _vector("hardIronOffset", offset),
-                "",
-            ]
+            lines += [_matrix("softIronMatrix", inverse), _vector("hardIronOffset", offset), ""]
             equation.append(
                 f"{name}: h [uT] = S (y - b), y in {triad.unit}\nS = {matrix_text(inverse)}\nb = {vector_text(offset)}"
             )

@@ -168,8 +168,7 @@ def noise_values(name: str, densities: Mapping[str, float], rate: float | None) 
             "run jaximu allan LOG -o DIR, or state the data sheet's figures in a Kalibr imu.yaml."
         )
     return {
-        key.name: key.factor * densities[key.density] ** key.exponent * (step**key.power if step else 1.0)
-        for key in made.keys
+        key.name: key.factor * densities[key.density] ** key.exponent * (step or 1.0) ** key.power for key in made.keys
     }
 
 
@@ -189,12 +188,11 @@ def noise_files(
         return {
             made.file: kalibr_yaml({key: (value, "") for key, value in values.items()}, rate, comments=head).encode()
         }
-    rows = [made.row.format(key=key.name, value=values[key.name], unit=key.unit) for key in made.keys]
     lines = [
         made.opening,
         *(f"# {text}" for text in head),
         made.head,
-        *rows,
+        *(made.row.format(key=key.name, value=values[key.name], unit=key.unit) for key in made.keys),
         made.tail.format(rate=rate, gravity=gravity),
     ]
     return {made.file: ("\n".join(filter(None, lines)) + "\n").encode()}
@@ -220,21 +218,23 @@ def _gtsam(
         "The plain ImuFactor takes the same without the two setBias lines: between two states it",
         "wants a BetweenFactor on the bias with sigma = sqrt(covariance * time).",
     ]
-    python = [f"# {text}" for text in head] + ["import gtsam", "import numpy as np", "", ""]
-    python += [
+    python = [
+        *(f"# {text}" for text in head),
+        "import gtsam",
+        "import numpy as np\n\n",
         f"def imu_parameters(gravity={gravity!r}):  # of a frame whose z points up",
         "    parameters = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)",
+        *(f"    parameters.{key}({value:.6e} * np.eye(3))  # {unit}" for key, value, unit in rows),
+        "    return parameters\n",
     ]
-    python += [f"    parameters.{key}({value:.6e} * np.eye(3))  # {unit}" for key, value, unit in rows]
-    python += ["    return parameters"]
-    cpp = [f"// {text}" for text in head]
-    cpp += [
+    cpp = [
+        *(f"// {text}" for text in head),
         "#pragma once",
-        "#include <gtsam/navigation/CombinedImuFactor.h>",
-        "",
+        "#include <gtsam/navigation/CombinedImuFactor.h>\n",
         f"inline auto imuParameters(double gravity = {gravity!r}) {{  // of a frame whose z points up",
         "  auto parameters = gtsam::PreintegrationCombinedParams::MakeSharedU(gravity);",
+        *(f"  parameters->{key}({value:.6e} * gtsam::I_3x3);  // {unit}" for key, value, unit in rows),
+        "  return parameters;",
+        "}\n",
     ]
-    cpp += [f"  parameters->{key}({value:.6e} * gtsam::I_3x3);  // {unit}" for key, value, unit in rows]
-    cpp += ["  return parameters;", "}"]
-    return {"gtsam_noise.py": ("\n".join(python) + "\n").encode(), "gtsam_noise.h": ("\n".join(cpp) + "\n").encode()}
+    return {"gtsam_noise.py": "\n".join(python).encode(), "gtsam_noise.h": "\n".join(cpp).encode()}

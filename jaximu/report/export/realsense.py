@@ -23,8 +23,7 @@ def write(parameters: ExportedUnit) -> Written:
     entry, equation = {}, []
     for name in ("accelerometer", "gyroscope"):
         triad = parameters.triads.get(name)
-        matrix = np.eye(3) if triad is None else triad.inverse
-        bias = np.zeros(3) if triad is None else matrix @ triad.bias
+        matrix, bias = (np.eye(3), np.zeros(3)) if triad is None else (triad.inverse, triad.inverse @ triad.bias)
         entry[name] = {"scale_and_alignment": matrix.T.ravel().tolist(), "bias": bias.tolist()}
         equation.append(f"{name}: u = M y - b\nM = {matrix_text(matrix)}\nb = {vector_text(bias)}")
     text = json.dumps({"device_type": "D435i", "imus": [entry]}, indent=4, sort_keys=True)

@@ -168,12 +168,10 @@ class _Targets:
         cubic = np.float32(fitted / size ** np.arange(4)[:, None] / unit).astype(float)
         written = np.vander((celsius - about)[counted], 4, increasing=True) @ (cubic * unit)
         error = written - model[counted]
-        if not constant:
-            written = written - error.mean(axis=0)
-            error = error - error.mean(axis=0)
-        self.loss[name] = _rms(error)
+        shift = 0.0 if constant else error.mean(axis=0)
+        self.loss[name] = np.sqrt(np.mean((error - shift) ** 2, axis=0))
         if self.working is not None:
-            self.left[name] = self.working.blocks.left(name, self.working.blocks.means[name] - written)
+            self.left[name] = self.working.blocks.left(name, self.working.blocks.means[name] - (written - shift))
         reading = self.calibration.reading
         return cubic if reading is None else cubic @ reading.autopilot_maps[name]
 
@@ -197,7 +195,3 @@ class _Targets:
         self, name: str, parameters: dict[str, float], lines: list[str], notes: list[str]
     ) -> AutopilotParameters:
         return AutopilotParameters(name, parameters, "\n".join(lines) + "\n", self.loss, tuple(notes), self.left)
-
-
-def _rms(error: FloatArray) -> FloatArray:
-    return np.sqrt(np.mean(error**2, axis=0))
