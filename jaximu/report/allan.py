@@ -140,7 +140,7 @@ def _hours(seconds: float) -> str:
 
 def _shown(analysis: NoiseAnalysis) -> Iterator[tuple[str, str, dict[str, Term]]]:
     """Yield each triad, the most important first, its quantity, and which of N, B and K show, means of the axes."""
-    for name in [name for name in _ORDER if name in analysis.axes]:
+    for name in sorted(analysis.axes, key=_ORDER.index):
         mean = mean_terms(analysis.axes[name])
         yield name, SENSOR_QUANTITIES[name], {term: one for term in "NBK" if (one := mean.get(term)) is not None}
 
@@ -220,7 +220,6 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
     tau = axes[0].deviation.tau
     longest, length = tau[-1], max(recorded_seconds(axes[0]), 2 * tau[-1])
     fine = np.geomspace(tau[0], longest, 200)
-    least, most = math.inf, 0.0
     for colour, fit in zip(AXES.values(), axes, strict=True):
         deviation = fit.deviation
         panel.fill_between(
@@ -234,9 +233,8 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
         )
         panel.plot(deviation.tau, factor * deviation.value, ".", color=colour, markersize=6, zorder=4)
         panel.plot(fine, factor * fit.allan_deviation(fine), color=colour, linewidth=1.2, zorder=3)
-        least = min(least, factor * deviation.low.min(), factor * deviation.value.min())
-        most = max(most, factor * deviation.value.max())
-    bottom, top = least / 4, most * 1.8
+    bottom = factor * min(min(fit.deviation.low.min(), fit.deviation.value.min()) for fit in axes) / 4
+    top = factor * max(fit.deviation.value.max() for fit in axes) * 1.8
     left, right = tau[0] / 1.4, length
     panel.set(xscale="log", yscale="log", xlim=(left, right), ylim=(bottom, top))
     whole = np.geomspace(left, right, 600)
@@ -306,7 +304,7 @@ def _headline(name: str, axes: Sequence[Identified]) -> str:
     return f"{name.capitalize()}: {first}{bottom}"
 
 
-def kalibr_text(analysis: NoiseAnalysis, topic: str = "/imu0") -> str:
+def kalibr_text(analysis: NoiseAnalysis) -> str:
     """Return Kalibr's `imu.yaml` for the analysis; comments say units and where each number comes from.
 
     One number a triad: the root mean square of its axes. A sensor that was not recorded is left out and said.
@@ -319,9 +317,7 @@ def kalibr_text(analysis: NoiseAnalysis, topic: str = "/imu0") -> str:
     }
 
     def comment(origin: tuple[str, ...]) -> str:
-        axes = {
-            source: [a for a, o in zip("xyz", origin, strict=False) if o == source] for source in dict.fromkeys(origin)
-        }
+        axes = {source: [a for a, o in zip("xyz", origin, strict=False) if o == source] for source in origin}
         return "; ".join(f"{', '.join(letters)}: {words[source]}" for source, letters in axes.items())
 
     inertial = [name for name in INERTIAL_QUANTITIES if name in analysis.axes]
@@ -341,7 +337,7 @@ def kalibr_text(analysis: NoiseAnalysis, topic: str = "/imu0") -> str:
         header.append(
             f"The sensors differ in rate ({', '.join(f'{rate:.6g} Hz' for rate in rates)}): the lower stands."
         )
-    return kalibr_yaml(numbers, float(f"{min(rates):.6g}"), topic, header)
+    return kalibr_yaml(numbers, float(f"{min(rates):.6g}"), comments=header)
 
 
 def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
@@ -392,8 +388,11 @@ def _cautions(analysis: NoiseAnalysis) -> Section:
     missing = [name for name in INERTIAL_QUANTITIES if name not in {*analysis.axes, *analysis.unusable}]
     cautions = []
     if poor:
-        text = f"The five terms do not describe the {listed(poor)} completely; the intervals are widened for it, see "
-        cautions.append(Statement("More than the five terms", f"{text}the notes.", True))
+        text = (
+            f"The five terms do not describe the {listed(poor)} completely; the intervals are widened for it, see the "
+            "notes."
+        )
+        cautions.append(Statement("More than the five terms", text, True))
     if missing:
         cautions.append(Statement("Not recorded", f"The recording has no {listed(missing, 'and no')}.", True))
     return Section("Before you rely on it", cautions)
@@ -426,9 +425,12 @@ def _terms(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
 def _terms_in_si(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
     """Yield a triad's terms in SI with their intervals, which the first screen has no room for."""
     quantity = SENSOR_QUANTITIES[name]
-    rows = [row for row in term_rows(analysis.axes[name], quantity) if row.unit == SI_UNITS[quantity][row.term]]
-    named = [replace(row, first=True).row(f"{row.term} {row.meaning}") for row in rows]
-    yield Table(("term", "unit", *_AXES), named) or _NONE
+    rows = [
+        replace(row, first=True).row(f"{row.term} {row.meaning}")
+        for row in term_rows(analysis.axes[name], quantity)
+        if row.unit == SI_UNITS[quantity][row.term]
+    ]
+    yield Table(("term", "unit", *_AXES), rows) or _NONE
 
 
 def _filter(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:

@@ -44,7 +44,10 @@ def page_of(budget: Budget) -> Page:
                 "quarters of its part.",
             ),
             _goals(budget),
-            _sources(budget),
+            Section(
+                "Sources, dominant first",
+                [Table(("source", "size (1σ)", "mean share of the variances", "most of"), source_rows(budget))],
+            ),
             _parameters(budget),
             _limits(budget),
         ),
@@ -61,13 +64,6 @@ def _goals(budget: Budget) -> Section:
             Statement(f"{goal.name} to {_wanted(goal)}", sentence(goal_words(budget, goal)), not goal.reached)
             for goal in budget.goals
         ],
-    )
-
-
-def _sources(budget: Budget) -> Section:
-    return Section(
-        "Sources, dominant first",
-        [Table(("source", "size (1σ)", "mean share of the variances", "most of"), source_rows(budget))],
     )
 
 

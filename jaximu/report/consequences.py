@@ -90,7 +90,7 @@ def _tracks(consequences: Consequences) -> Iterator[Part]:
 
 def _tables(consequences: Consequences) -> Iterator[Section]:
     """Return the position error by term, and all errors by direction, at the times that are shown."""
-    times = _headers(consequences)
+    times = [f"after {_seconds(consequences.times[row])}" for row in _places(consequences)]
     yield Section(
         "Position error by term (1σ)",
         [
@@ -145,11 +145,6 @@ def _places(consequences: Consequences) -> list[int]:
     wanted = [time for time in _SHOWN if time < consequences.times[-1]]
     nearest = [int(np.argmin(np.abs(consequences.times - time))) for time in wanted]
     return list(dict.fromkeys([*nearest, len(consequences.times) - 1]))
-
-
-def _headers(consequences: Consequences) -> list[str]:
-    """Return the times that are shown, in words."""
-    return [f"after {_seconds(consequences.times[row])}" for row in _places(consequences)]
 
 
 def _order(consequences: Consequences) -> list[str]:

@@ -85,7 +85,9 @@ def _first(diagnosis: Diagnosis, twin: Twin) -> Iterator[Part]:
     yield from _certainty(diagnosis)
     yield from _cost(diagnosis)
     yield Section("The recording itself", [_mistake(diagnosis, finding) for finding in diagnosis.preflight])
-    yield Section("What is missing in the model", [_effects_table(diagnosis)])
+    effects = [_effect_row(effect) for effect in diagnosis.effects]
+    headers = ("effect", "adds up to", "coefficients ± 95 %", "evidence")
+    yield Section("What is missing in the model", [Table(headers, effects)])
     yield from _lines_part(diagnosis)
     yield from _learned_part(diagnosis)
     yield Section("What the extension gains on data that was not fitted", [*_gains(diagnosis)])
@@ -243,16 +245,8 @@ def _mistake(diagnosis: Diagnosis, finding: Finding) -> Statement:
     return Statement(sentence(effect_title(finding.name)), " ".join(texts) or "See above.", caution=True)
 
 
-def _effects_table(diagnosis: Diagnosis) -> Table:
-    """Return each cause with what it is, what it adds to the output, its coefficients and its evidence."""
-    return Table(
-        ("effect", "adds up to", "coefficients ± 95 %", "evidence"),
-        [_effect_row(effect) for effect in diagnosis.effects],
-    )
-
-
 def _effect_row(effect: Named | NoiseFinding) -> tuple[str, str, str, str]:
-    """Return a cause's cells."""
+    """Return a cause's cells: what it is, what it adds to the output, its coefficients and its evidence."""
     evidence = effect.evidence + " (weak)" * effect.weak
     numbers = "\n".join(effect.numbers())
     if isinstance(effect, NoiseFinding):
@@ -288,7 +282,7 @@ def _lines_figure(diagnosis: Diagnosis) -> Figure:
     figure, grid = figures.stacked(len(axes_of), 2.4, 0.6)
     for axes, key in zip(grid, axes_of, strict=True):
         mine = [one for one in diagnosis.lines if (one.recording, one.triad, one.line.axis) == key]
-        times, power = spectrum_at_rest(parts[key[0]], key[1], key[2])
+        times, power = spectrum_at_rest(parts[key[0]], *key[1:])
         axes.pcolormesh(
             times,
             np.linspace(0, mine[0].line.rate / 2, power.shape[1]),
@@ -433,8 +427,7 @@ def _in_plausible_sizes(diagnosis: Diagnosis, name: str, limit: float) -> float:
     """Return an effect's detection limit in multiples of a plausible size."""
     kind, imu = CATALOGUE[name], diagnosis.base.imu
     triad = imu.triads().get(kind.owner, imu.accelerometer)
-    scale = float(np.mean(triad.scales))
-    return limit / (kind.typical * (scale if kind.unit.startswith("output") else 1.0))
+    return limit / (kind.typical * (float(np.mean(triad.scales)) if kind.unit.startswith("output") else 1.0))
 
 
 def _options(diagnosis: Diagnosis) -> Iterator[Part]:

@@ -139,12 +139,12 @@ def _power_of_ten(value: float, _: int | None = None) -> str:
 # --- the recording ----------------------------------------------------------------------------------------------------
 
 
-def envelope(time: FloatArray, values: FloatArray, most: int = _MOST_POINTS) -> tuple[FloatArray, FloatArray]:
-    """Thin (n, m) samples to at most `most` rows that keep each stretch's lowest and highest value in every column."""
-    count, stretches = len(time), most // 2
-    if count <= most:
+def envelope(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Thin (n, m) samples to a trace's rows, which keep each stretch's lowest and highest value in every column."""
+    count = len(time)
+    if count <= _MOST_POINTS:
         return time, values
-    starts = np.linspace(0, count, stretches, endpoint=False).astype(int)
+    starts = np.linspace(0, count, _MOST_POINTS // 2, endpoint=False).astype(int)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     ends = np.append(starts[1:], count) - 1
     return np.stack([time[starts], time[ends]], axis=1).reshape(-1), np.stack([low, high], axis=1).reshape(

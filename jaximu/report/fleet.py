@@ -149,7 +149,7 @@ def _differences(fleet: Fleet) -> Iterator[Part]:
             ],
         )
     elif fleet.population is not None:
-        lots = len({lot for lot in fleet.lots if lot})
+        lots = len({*fleet.lots} - {""})
         yield (
             f"{lots} lots were compared; none differs from the others."
             if lots > 1
@@ -200,12 +200,13 @@ def _diagnoses(fleet: Fleet) -> Section:
 
 def amount(name: Name, value: float, sigma: float = 0.0) -> str:
     """Put a relative parameter into the unit a person compares, with half its 95 % interval where it has one."""
-    *_, unit, factor = next(kind for kind in _KINDS if _is(name, kind))
+    *_, unit, factor = _kind_of(name)
     return with_interval(factor * value, factor * sigma, unit) if sigma else f"{number(factor * value, 3)} {unit}"
 
 
-def _is(name: Name, kind) -> bool:
-    return kind[:3] == (name.owner, name.part, name.axes[0] == name.axes[-1])
+def _kind_of(name: Name) -> tuple[str, str, bool, str, str, float]:
+    about = name.owner, name.part, name.axes[0] == name.axes[-1]
+    return next(kind for kind in _KINDS if kind[:3] == about)
 
 
 # --- the population ---------------------------------------------------------------------------------------------------
@@ -289,7 +290,7 @@ def _prior(fleet: Fleet) -> Iterator[Section]:
 
 def _panels(population: Population, title: str) -> tuple[Figure, list[tuple[Axes, tuple, list[int]]]]:
     """Return a figure with a panel for each kind of parameter, its kind, and which parameters are of it."""
-    places = {kind: [k for k, name in enumerate(population.names) if _is(name, kind)] for kind in _KINDS}
+    places = {kind: [k for k, name in enumerate(population.names) if _kind_of(name) == kind] for kind in _KINDS}
     there = [(kind, columns) for kind, columns in places.items() if columns]
     rows = (len(there) + 2) // 3
     figure = figures.new_figure(0.4 + 2.9 * rows)
@@ -365,10 +366,10 @@ def lot_figure(fleet: Fleet, difference: Difference) -> Figure:
     population = fleet.population
     assert population is not None
     name = difference.parameters[0][0]
-    kind = next(kind for kind in _KINDS if _is(name, kind))
-    values = kind[-1] * (fleet.values[:, population.names.index(name)] - population.mean[population.names.index(name)])
+    kind, k = _kind_of(name), population.names.index(name)
+    values = kind[-1] * (fleet.values[:, k] - population.mean[k])
     lots = np.array(fleet.lots)
-    names = [lot for lot in sorted(set(fleet.lots)) if lot]
+    names = sorted({*fleet.lots} - {""})
     different = [difference.group for difference in fleet.differences if difference.kind == "lot"]
     if len(names) > 40:
         names = [*different[:10], *[lot for lot in names if lot not in different][:30]]

@@ -49,8 +49,8 @@ def _amount(movement: Movement, value: float, sigma: float, sign: bool = True) -
     return with_interval(factor * value, factor * sigma, movement.unit if factor == 1.0 else shown, sign)
 
 
-def _drift(history: UnitHistory, movement: Movement) -> str:
-    return f"{_amount(movement, movement.line.slope, movement.line.half / Z95)}/{history.per}"
+def _drift(movement: Movement) -> str:
+    return _amount(movement, movement.line.slope, movement.line.half / Z95)
 
 
 def _duration(history: UnitHistory, time: float) -> str:
@@ -199,7 +199,7 @@ def _numbers_table(history: UnitHistory) -> Table:
             f"{abs(movement.z):.1f}",
             p_value,
         ]
-        row += [_amount(movement, movement.line.slope, movement.line.half / Z95)] * over_time
+        row += [_drift(movement)] * over_time
         rows.append(row + [probability(movement.line.p_value).removeprefix("= ")] * straight)
     caption = (
         f"p: of no change in all {len(history.files)} calibrations, with all numbers allowed for (Holm). Moved is "
@@ -209,8 +209,8 @@ def _numbers_table(history: UnitHistory) -> Table:
         caption += ". Drift: of the line through all values, ± 95 %"
     if straight:
         caption += "; p, straight: of scatter as large about it; below 0.05 the interval is widened by that scatter"
-    moved = range(len(history.moved))
-    return Table(tuple(headers), rows, f"{caption}.", moved, brief=max(6, len(moved)))
+    count = len(history.moved)
+    return Table(tuple(headers), rows, f"{caption}.", range(count), brief=max(6, count))
 
 
 def _together_table(history: UnitHistory) -> Table:
@@ -241,7 +241,7 @@ def _limits_table(history: UnitHistory) -> Table:
             spoken(reached.name),
             between(limit.low, limit.high, limit.unit, limit.stated),
             level,
-            _drift(history, movement),
+            f"{_drift(movement)}/{history.per}",
             after,
         )
 

@@ -40,6 +40,7 @@ _TITLES = {
 }
 _ORDER = ("golden", "station", "lot", "average", "value", "jump")
 _VALUE, _OUT, _AVERAGE = figures.AXES.values()
+_WithCpk = Sequence[tuple[FollowedQuantity, float]]
 
 
 def page_of(line: Line) -> Page:
@@ -74,13 +75,13 @@ def page_of(line: Line) -> Page:
 # --- the first lines --------------------------------------------------------------------------------------------------
 
 
-def _by_capability(line: Line) -> list[tuple[FollowedQuantity, float]]:
+def _by_capability(line: Line) -> _WithCpk:
     """Return the quantities that have limits with their Cpk, the worst first."""
     able = [(quantity, quantity.capability.cpk[0]) for quantity in line.followed if quantity.capability is not None]
     return sorted(able, key=lambda pair: pair[1])
 
 
-def _number(line: Line, able: Sequence[tuple[FollowedQuantity, float]]) -> tuple[str, str]:
+def _number(line: Line, able: _WithCpk) -> tuple[str, str]:
     """Return the worst Cpk with its interval, else how many recordings pass, and what it is."""
     if able and (capability := able[0][0].capability) is not None:
         return _index(
@@ -91,7 +92,7 @@ def _number(line: Line, able: Sequence[tuple[FollowedQuantity, float]]) -> tuple
     return "", ""
 
 
-def _verdict(line: Line, able: Sequence[tuple[FollowedQuantity, float]]) -> Iterator[str]:
+def _verdict(line: Line, able: _WithCpk) -> Iterator[str]:
     if able and able[0][1] < _CAPABLE:
         yield _why_not_capable(able[0][0])
     elif able:
@@ -138,7 +139,7 @@ def _next(line: Line) -> str:
 # --- tables -----------------------------------------------------------------------------------------------------------
 
 
-def _capability(line: Line, able: Sequence[tuple[FollowedQuantity, float]]) -> Section:
+def _capability(line: Line, able: _WithCpk) -> Section:
     judged = line.judged
     failed = {} if judged is None else dict(zip(judged.names, np.sum(judged.verdict == FAIL, axis=0), strict=True))
     return Section(
@@ -171,7 +172,7 @@ def _capability_row(quantity: FollowedQuantity, failed: int) -> tuple[str, ...]:
     )
 
 
-def _worst_lots(able: Sequence[tuple[FollowedQuantity, float]]) -> Section:
+def _worst_lots(able: _WithCpk) -> Section:
     rows = []
     for quantity, _ in able:
         if quantity.lots:

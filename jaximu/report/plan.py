@@ -249,5 +249,5 @@ def _poses_figure(proposal: Proposal) -> Figure:
     return figure
 
 
-def _folded(words: str, width: int = 36) -> str:
-    return "\n".join(line for part in words.split("; ") for line in textwrap.wrap(part, width))
+def _folded(words: str) -> str:
+    return "\n".join(line for part in words.split("; ") for line in textwrap.wrap(part, 36))

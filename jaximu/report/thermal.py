@@ -54,7 +54,10 @@ def page_of(thermal: ThermalCalibration, exports: Sequence[AutopilotParameters] 
             Section("What these recordings can separate", [*thermal.identifiability.words, *_ways(thermal)]),
             Section("Effects", [effect_table(thermal.calibration)]),
             Section("Models that were tried", [*_candidates(thermal)]),
-            *(_export(export, thermal) for export in exports),
+            *(
+                Section(f"{export.name} parameters", [loss_words(export, thermal), Items(export.notes)])
+                for export in exports
+            ),
         ),
         partial(_rest, thermal),
         thermal.notes,
@@ -244,11 +247,6 @@ def _largest_change(calibration: Calibration, owner: str, plain: str) -> tuple[s
     return (*(with_interval(largest, spread) for largest, spread in cells), unit)
 
 
-def _export(export: AutopilotParameters, thermal: ThermalCalibration) -> Section:
-    """Say what an autopilot's parameters lose, and how to use them."""
-    return Section(f"{export.name} parameters", [loss_words(export, thermal), Items(export.notes)])
-
-
 def _rest(thermal: ThermalCalibration) -> Iterator[Part]:
     """Return the temperatures covered, each sensor's surface and residuals, and how it was done."""
     yield Section(
@@ -414,9 +412,9 @@ def surface_figure(thermal: ThermalCalibration, name: str) -> Figure:
     surface = np.stack([thermal.bias(name, temperature, rate)[0] for rate in rates])  # (r, m, 3)
     drawn = _within_data(thermal, temperature, rates)
     data, parts = bias_dots(thermal, name), _both_ways(thermal)
+    x, y = np.meshgrid(temperature, 60 * rates)
     for axis in range(3):
         panel: Any = figure.add_subplot(1, 3, axis + 1, projection="3d")
-        x, y = np.meshgrid(temperature, 60 * rates)
         cells = _cells(np.stack([x, y, factor * surface[:, :, axis]], axis=-1), drawn)
         panel.add_collection3d(Poly3DCollection(cells, facecolors="#888888", alpha=0.45, linewidth=0))
         panel.auto_scale_xyz(*cells.reshape(-1, 3).T)

@@ -141,11 +141,16 @@ def _at_rest(calibration: Calibration, half: FloatArray) -> Iterator[str]:
         )
 
 
+def _rate_known(calibration: Calibration, extent: Range, rates: FloatArray) -> FloatArray:
+    """Return half the 95 % interval (n,) of the corrected rate, °/s, z up while turning at rates (n, 3), rad/s."""
+    up = np.tile([0.0, 0.0, 1.0], (len(rates), 1))
+    stimulus = steady(up, extent.gravity, np.mean(extent.temperature), rates)
+    return Z95 * np.degrees(calibration.uncertainty_of(stimulus)["gyroscope"].largest)
+
+
 def _turning(calibration: Calibration, extent: Range) -> str:
     """Say how well the corrected rate is known at rest, and at the end of the range about the worst axis."""
-    rates = np.concatenate([np.zeros((1, 3)), extent.rate * _FACES])
-    stimulus = steady(np.tile([0.0, 0.0, 1.0], (len(rates), 1)), extent.gravity, np.mean(extent.temperature), rates)
-    half = Z95 * np.degrees(calibration.uncertainty_of(stimulus)["gyroscope"].largest)
+    half = _rate_known(calibration, extent, np.concatenate([np.zeros((1, 3)), extent.rate * _FACES]))
     worst = 1 + int(np.argmax(half[1:]))
     still, turning = (
         f"known to ±{number(value, 2)} °/s (95 %)" if np.isfinite(value) else "not determined"
@@ -157,18 +162,16 @@ def _turning(calibration: Calibration, extent: Range) -> str:
 
 def _panels(calibration: Calibration, extent: Range) -> Iterator[tuple[str, str, str, dict[str, FloatArray], Any]]:
     """Return title, words of both axes, lines by name and their heights (lines, n) of each panel."""
-    triads, gravity = calibration.triads(), extent.gravity
+    triads = calibration.triads()
     if "gyroscope" in triads:
         rates = np.linspace(0.0, np.degrees(extent.rate), _STEPS)
         both = np.radians(rates)[:, None, None] * _FACES
-        up = np.tile([0.0, 0.0, 1.0], (both.size // 3, 1))
-        stimulus = steady(up, gravity, np.mean(extent.temperature), both.reshape(-1, 3))
-        half = Z95 * np.degrees(calibration.uncertainty_of(stimulus)["gyroscope"].largest).reshape(-1, 2, 3)
+        half = _rate_known(calibration, extent, both.reshape(-1, 3)).reshape(-1, 2, 3)
         yield "Rate while turning", "rate (°/s)", "± 95 % (°/s)", {axis: rates for axis in "xyz"}, half.max(axis=1).T
     warm = {name for name, triad in triads.items() if any("temperature" in effect.needs for effect in triad.effects)}
     low, high = calibration.data.get("temperature_range", extent.temperature)
     temperatures = np.linspace(low, high, _STEPS)
-    stimulus = steady(np.tile(_FACES, (len(temperatures), 1)), gravity, np.repeat(temperatures, len(_FACES)))
+    stimulus = steady(np.tile(_FACES, (len(temperatures), 1)), extent.gravity, np.repeat(temperatures, len(_FACES)))
     uncertainty = calibration.uncertainty_of(stimulus) if warm & {"accelerometer", "gyroscope"} else {}
     for name, title, factor, unit in (
         ("accelerometer", "Specific force at rest, the worst of six faces up", 1e3, "mm/s²"),
