@@ -50,7 +50,7 @@ GROUPS = {
     "Fleet": "fleet accept verify",
     "Simulate and plan": "demo simulate plan",
 }
-"""How the overview arranges them."""
+"""How the overview arranges them all."""
 LOG = "LOG"
 """What stands for a log in place of a verb, in messages."""
 _FIRST = "compiling for the first time on this machine; later runs start sooner"
@@ -109,13 +109,6 @@ def _names_log(word: str) -> bool:
     return word == LOG or bool(word and (set(word) & set("./\\") or Path(word).exists()))
 
 
-def _groups() -> dict[str, list[str]]:
-    """Return the verbs by what they are for; one that is in no group stands in the last."""
-    groups = {title: names.split() for title, names in GROUPS.items()}
-    more = [name for name in VERBS if not any(name in names for names in groups.values())]
-    return groups | ({"More": more} if more else {})
-
-
 def _parse(name: str, arguments: Sequence[str]) -> Callable[[], None]:
     """Return a verb with its arguments. Raises `InputError` for a mistake in them."""
     command = command_of(name)
@@ -164,7 +157,7 @@ def _run(arguments: Sequence[str]) -> int:
     elif name == "help" and rest and rest[0] in (*VERBS, LOG):
         print(help_text(rest[0], command_of(rest[0])))
     elif name in ("--help", "-h") or (name == "help" and not rest):
-        print(listed(_groups(), command_of))
+        print(listed(GROUPS, command_of))
     elif name in ("--version", "-V", "version"):
         print(f"jaximu {__version__}")
     elif name == "--completion":
@@ -178,7 +171,7 @@ def _run(arguments: Sequence[str]) -> int:
             f"there is no command {name!r}{f' (did you mean {near[0]}?)' if near else ''}; `jaximu --help` lists them."
         )
     else:
-        print(listed(_groups(), command_of), file=sys.stderr)
+        print(listed(GROUPS, command_of), file=sys.stderr)
         return 2
     return 0
 

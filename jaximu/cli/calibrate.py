@@ -61,17 +61,20 @@ class CalibrateCommand(options.Fits):
             calibration = self._of_means(gravity, unusable)
         else:
             recordings, known = self.log.read_unit(self.logs, gravity, self.noise)
-            choices = {
-                "static": known,
-                "segmentation": self.poses.value(),
-                "method": self.method,
-                "loss": self.loss,
-                "repair": self.repair,
-            }
+            poses = self.poses.value()
             with progress("calibrating"):
                 from jaximu.calibration import calibrate
 
-                calibration = calibrate(recordings, gravity, **choices, **options.effects_of(self.effect))
+                calibration = calibrate(
+                    recordings,
+                    gravity,
+                    static=known,
+                    segmentation=poses,
+                    method=self.method,
+                    loss=self.loss,
+                    repair=self.repair,
+                    **options.effects_of(self.effect),
+                )
         calibration = replace(calibration, trace=trace)
         self.results.present(calibration.summary, calibration=calibration)
 

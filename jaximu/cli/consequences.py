@@ -13,6 +13,7 @@ from jaximu.cli.messages import progress
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 from jaximu.ground.reexport import later
+from jaximu.ground.units import SENSOR_UNITS
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
 
 _LATITUDE = 45.0
-_LIMITS = {"accelerometer": ("--accel-range", "specific_force"), "gyroscope": ("--gyro-range", "angular_rate")}
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class ConsequencesCommand(options.Reads):
         _require_densities(targets, noise or {})
         gravity = model.gravity if self.local == options.LOCAL else self.local.value()
         site = Place(_LATITUDE if self.local.latitude is None else self.local.latitude, self.local.height, gravity)
-        limits = _limits({"accelerometer": self.accel_range, "gyroscope": self.gyro_range})
+        limits = self._limits()
         measured = self._measured(model, site)
         trajectory, stated = self._trajectory(model, site, measured)
         trajectory.require_range(stated | limits)
@@ -156,6 +156,21 @@ class ConsequencesCommand(options.Reads):
             )
         return targets
 
+    def _limits(self) -> dict[str, float]:
+        """Return the ranges that were stated, by triad in SI."""
+        from jaximu.model.data_sheet import parse_quantity
+
+        limits = {}
+        for triad, name, text in (
+            ("accelerometer", "--accel-range", self.accel_range),
+            ("gyroscope", "--gyro-range", self.gyro_range),
+        ):
+            if text is not None:
+                limits[triad] = parse_quantity(text, SENSOR_UNITS[triad], name)
+                if not 0 < limits[triad] < math.inf:
+                    raise InputError(f"{name}: {text!r} is no range.")
+        return limits
+
     def _measured(self, model: Calibration, site: Place) -> MeasuredErrors | None:
         """Return the errors of the calibrated unit along a log against what a reference measured; None without one."""
         if self.reference is None or self.path is None:
@@ -203,8 +218,8 @@ def _require_densities(targets: list[str], noise: SensorNoise) -> None:
 
     known = {"update_rate": 1.0, "integration_covariance": 1.0}
     for triad, terms in noise.items():
-        known |= {f"{triad}_noise_density": float("N" in terms)}
-        known |= {f"{triad}_random_walk": float("K" in terms or "B" in terms)}
+        known[f"{triad}_noise_density"] = float("N" in terms)
+        known[f"{triad}_random_walk"] = float("K" in terms or "B" in terms)
     for name in targets:
         noise_values(name, known, 1.0)
 
@@ -219,17 +234,3 @@ def _files(targets: list[str], noise: EstimatorNoise, gravity: float) -> dict[st
     for name in targets:
         made |= noise_files(name, noise.densities(), noise.rate, head, gravity)
     return made
-
-
-def _limits(stated: dict[str, str | None]) -> dict[str, float]:
-    """Return the ranges that were stated, by triad in SI."""
-    from jaximu.model.data_sheet import SI_UNITS, parse_quantity
-
-    limits = {}
-    for triad, text in stated.items():
-        if text is not None:
-            option, quantity = _LIMITS[triad]
-            limits[triad] = parse_quantity(text, SI_UNITS[quantity]["B"], option)
-            if not 0 < limits[triad] < math.inf:
-                raise InputError(f"{option}: {text!r} is no range.")
-    return limits

@@ -88,7 +88,6 @@ def _catalogue(kinds: list[type[Effect]]) -> Page:
 
 def _page(kind: type[Effect]) -> Page:
     """Return the page of one effect."""
-    paragraphs = (inspect.getdoc(kind) or "").split("\n\n")
     rows = [
         (
             "coefficients",
@@ -113,5 +112,5 @@ def _page(kind: type[Effect]) -> Page:
         usual = joined(plain(parameter.typical), unit_text(parameter.unit))
         text = f"{parameter.meaning}; {usual}, from {plain(parameter.low)} to {plain(parameter.high)}"
         rows.append((inner.replace("_", " "), text))
-    text = [" ".join(paragraph.split()) for paragraph in paragraphs]
+    text = [" ".join(paragraph.split()) for paragraph in (inspect.getdoc(kind) or "").split("\n\n")]
     return Page(kind.title, (kind.formula,), first=(*text, Table((), rows)))

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from jaximu.recordings.recording import Recording
 
 
-_STILL_FORCE, _STILL_RATE = 0.2, 0.03  # m/s² and rad/s: rms about the mean of a second that counts as still
+_STILL = {"accelerometer": (0.2, "m/s²"), "gyroscope": (0.03, "rad/s")}
+"""Rms about its mean below which a second counts as still, and the unit."""
 _PARTS = 8  # of a rest, by which the interval of its mean is told
 _BIAS = 0.5  # rad/s: largest bias of a gyroscope that is taken for rest
 _MIDDLE = 0.1  # m/s²: how far that mean may lie from the second before
@@ -84,7 +85,7 @@ class InfoCommand:
 
         for path, (document, uses), reading in zip(self.logs, described, stated, strict=True):
             guess = document.get("guess")
-            line = f" {guess['line']}" if guess else reading.line()
+            line = f" {guess['line']}" if guess else options.typed(reading)
             show(log_page(document, [use.line(path, line) for use in uses]))
 
 
@@ -280,22 +281,22 @@ def _at_rest(recording: Recording, repaired: Recording, findings: list[str]) -> 
     from jaximu.recordings.recording import runs_of
     from jaximu.report.recording import signal_facts
 
-    names = [name for name in ("accelerometer", "gyroscope") if name in recording.signals]
+    names = [name for name in _STILL if name in recording.signals]
     start, still, rates = _still_seconds(repaired)
     length = signal_facts(recording.signals[names[0]], repaired.signals[names[0]])["duration"]
     if not still.any():
         return length, 0.0, 0.0, 0.0
     first, stop = max(runs_of(still), key=lambda run: run[1] - run[0])
     rest, longest = float(still.sum()), float(stop - first)
-    limits = {"accelerometer": f"{_STILL_FORCE:g} m/s²", "gyroscope": f"{_STILL_RATE:g} rad/s"}
+    limits = [f"{limit:g} {unit}" for limit, unit in map(_STILL.__getitem__, names)]
     findings.append(
         f"still for {rest:.0f} s of {length:.0f} s, {longest:.0f} s at a stretch (seconds with less than "
-        f"{' and '.join(limits[name] for name in names)} rms)"
+        f"{' and '.join(limits)} rms)"
     )
     rates = rates[still] if recording.gyroscope is not None and recording.gyroscope.unit != "count" else rates[:0]
     size = np.linalg.norm(rates, axis=1)
     if len(rates) >= _PARTS and size.min() < _BIAS:  # a table's steady turn looks like a rest: the slowest is one
-        near = np.linalg.norm(rates - rates[np.argmin(size)], axis=1) < _STILL_RATE
+        near = np.linalg.norm(rates - rates[np.argmin(size)], axis=1) < _STILL["gyroscope"][0]
         findings += [_offset(rates[near])] if near.sum() >= _PARTS else []
     return length, rest, longest, float(start + first)
 
@@ -386,8 +387,7 @@ def _still_seconds(recording: Recording) -> tuple[float, BoolArray, FloatArray]:
 
     from jaximu.recordings.segmentation import Moments
 
-    limits = {"accelerometer": _STILL_FORCE, "gyroscope": _STILL_RATE}
-    sensors = [(signal, limits[name]) for name, signal in recording.signals.items() if name in limits]
+    sensors = [(signal, _STILL[name][0]) for name, signal in recording.signals.items() if name in _STILL]
     start, rates = max(signal.time[0] for signal, _ in sensors), np.zeros((0, 3))
     begins = start + np.arange(max(int(min(signal.time[-1] for signal, _ in sensors) - start), 0))
     still = np.ones(len(begins), bool)

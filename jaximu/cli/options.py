@@ -143,10 +143,6 @@ class LogOptions:
         units = {name: unit for name, unit in calibration.reading.units.items() if name in triads}
         return replace(self, like=replace(calibration.reading, units=units))
 
-    def line(self) -> str:
-        """Return the options that were given, as one types them."""
-        return typed(self)
-
     def with_gyroscope(self, path: Path) -> LogOptions:
         """Return the options with the gyroscope's file, where an app or a logger wrote one beside the accelerometer's.
 
@@ -169,7 +165,7 @@ class LogOptions:
         recording = read_recording(path, gyroscope, self.reading(gravity, check, alone))
         if self.like is not None:
             names = [name for name in ("columns", "gyro_columns", "axes") if getattr(self, name) is None]
-            taken = LogOptions(**{name: getattr(recording.reading, name) for name in names}).line()
+            taken = typed(LogOptions(**{name: getattr(recording.reading, name) for name in names}))
             if taken:
                 say(f"{path} is read as the calibrated log was:{taken}.")
         return recording

@@ -80,13 +80,7 @@ class PlanCommand(options.Reads):
             raise InputError("--effect names states of the filter: add --for filter.")
         chosen = FILTERED if filtered else EQUIPMENT[self.equipment]
         count = (19 if filtered else 12) if self.poses is None else self.poses
-        stated = {
-            "rest": self.rest,
-            "turn": self.turn,
-            "fastest": self.fastest,
-            "step": self.step,
-            "accuracy": self.accuracy,
-        }
+        stated = {name: getattr(self, name) for name in ("rest", "turn", "fastest", "step", "accuracy")}
         if self.fastest is not None and (chosen.by_hand or not 0 < self.fastest < math.inf):
             raise InputError("--fastest is the largest rate of a table, in °/s: greater than zero, and not for hands.")
         if self.accuracy is not None and chosen.accuracy is None:

@@ -72,9 +72,16 @@ class SimulateCommand:
                     truth.save_schedule(f"{path}.schedule.csv")
                 for note in truth.notes:
                     say(f"{path}: {note}")
-                duration, notes = case.plan.motion.length, list(truth.notes)
-                entry = {"file": str(path), "truth": f"{path}.truth.json", "samples": case.samples}
-                written.append(entry | {"duration": duration, "notes": notes})
+                duration = case.plan.motion.length
+                written.append(
+                    {
+                        "file": str(path),
+                        "truth": f"{path}.truth.json",
+                        "samples": case.samples,
+                        "duration": duration,
+                        "notes": list(truth.notes),
+                    }
+                )
                 if not self.as_json:
                     say(f"{path}: {case.samples} samples, {duration:g} s")
         if self.as_json:

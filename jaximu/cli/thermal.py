@@ -75,11 +75,9 @@ class ThermalCommand(options.Fits):
             raise InputError(f"{first} is poses by hand and others are a unit at rest: give one kind at a time.")
         with progress("fitting"):
             thermal = calibrate_thermal(recordings, static=known, base=base, block=self.block)
-            exports = (
-                {"px4.params": px4_parameters(thermal, self.sensor or 0, self.accel_id, self.gyro_id)}
-                if "px4" in self.to
-                else {}
-            )
+            exports = {}
+            if "px4" in self.to:
+                exports["px4.params"] = px4_parameters(thermal, self.sensor or 0, self.accel_id, self.gyro_id)
             if "ardupilot" in self.to:
                 exports["ardupilot.param"] = ardupilot_parameters(thermal, 1 if self.sensor is None else self.sensor)
         self.results.present(

@@ -133,8 +133,8 @@ def _lines(left: str, text: str, width: int, indent: int = 26) -> list[str]:
     return [f"  {left:<{indent - 2}}{wrapped[0]}".rstrip(), *(f"{'':{indent}}{line}" for line in wrapped[1:])]
 
 
-def listed(groups: Mapping[str, Sequence[str]], verb: Callable[[str], type[Any]]) -> str:
-    """Return the overview: the usage, and by group what each verb does in its own words."""
+def listed(groups: Mapping[str, str], verb: Callable[[str], type[Any]]) -> str:
+    """Return the overview: the usage, and by group what each verb does in its own words; `groups`: names by title."""
     width = min(shutil.get_terminal_size().columns, 100)
     lines = [
         "usage: jaximu VERB [OPTIONS] …",
@@ -145,7 +145,7 @@ def listed(groups: Mapping[str, Sequence[str]], verb: Callable[[str], type[Any]]
     ]
     for group, names in groups.items():
         lines.append(f"{group}:")
-        for name in names:
+        for name in names.split():
             text = " ".join((inspect.getdoc(verb(name)) or "").partition("\n\n")[0].split())
             lines += _lines(name, text, width, 17)
         lines.append("")
