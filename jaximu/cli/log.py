@@ -434,13 +434,14 @@ class _Report:
 
     def _next(self, names: set[str]) -> str:
         """Return the next command, with the names of files that there are."""
-        folder, logs = self.results.output, " ".join(shlex.quote(str(path)) for path in self.logs)
+        folder = self.results.output
         if folder is None:
-            return f"jaximu {logs}{self.stated} -o results"
+            return f"jaximu {shlex.join(map(str, self.logs))}{self.stated} -o results"
         proposed = _COMMAND.search(self.results.filled(self.outcomes[self.lead].page().next, names))
         if proposed and not _UNFILLED.search(proposed[1]):
             return proposed[1]
-        path = {name: shlex.quote(str(folder / f"{name}.json")) for name in names}
-        if "calibration" in path:
-            return f"jaximu compensate {path['calibration']} {shlex.quote(str(self.contents[0].path))} -o corrected.csv"
-        return f"jaximu calibrate POSES.csv --noise {path['allan']} -o {shlex.quote(str(folder))}"
+        if "calibration" in names:
+            paths = shlex.join([str(folder / "calibration.json"), str(self.contents[0].path)])
+            return f"jaximu compensate {paths} -o corrected.csv"
+        noise = shlex.quote(str(folder / "allan.json"))
+        return f"jaximu calibrate POSES.csv --noise {noise} -o {shlex.quote(str(folder))}"

@@ -82,7 +82,6 @@ def share_words(calibration: Calibration) -> list[str]:
 
 def page_of(calibration: Calibration, measurement: AgainstAttitude) -> Page:
     """Return the page of a calibration against a measured attitude."""
-    trust, unknown = gravity_statements(calibration), partial(limits, calibration)
     return calibration_page(
         calibration,
         [
@@ -93,8 +92,8 @@ def page_of(calibration: Calibration, measurement: AgainstAttitude) -> Page:
                 "Grey: the data sheet's unit, mounted as was coarsely found. Blue: calibrated. All three axes.",
             )
         ],
-        trust,
-        unknown,
+        gravity_statements(calibration),
+        partial(limits, calibration),
         findings=[
             Statement("The reference", " ".join(mounting_words(calibration))),
             Statement(

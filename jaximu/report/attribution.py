@@ -72,8 +72,8 @@ def _sentence(finding: Attributed, attribution: Attribution) -> str:
     if finding.belongs_to == "unit":
         return f"{title} belongs to {_names('unit', finding.units, attribution.units)}: it repeats over the sessions."
     if finding.belongs_to == "session":
-        where = _names("session", finding.sessions, attribution.sessions)
-        return f"{title} belongs to {where}: the units have it in common there."
+        sessions = _names("session", finding.sessions, attribution.sessions)
+        return f"{title} belongs to {sessions}: the units have it in common there."
     return f"{title} belongs to the board: all units have it in common in all sessions."
 
 

@@ -189,7 +189,7 @@ def _next(budget: Budget) -> str:
 
 def parameter_rows(budget: Budget) -> list[tuple[str, ...]]:
     """Return each parameter in words, its 1σ, what it is made of (dominant first), and its 1σ by Monte Carlo."""
-    part, total, off = shares(budget), budget.total, budget.nonlinear()
+    part, off = shares(budget), budget.nonlinear()
     rows = []
     for index in _reading_order(budget):
         words, unit = describe(budget.names[index], budget.imu), budget.units[index]
@@ -201,7 +201,7 @@ def parameter_rows(budget: Budget) -> list[tuple[str, ...]]:
         wrong = [budget.sources[row].words for row, column in off if column == index]
         made += [f"not linear in {source}" for source in wrong]
         drawn = "" if budget.check is None else amount(budget.check.rms[index], unit)
-        rows.append((words, amount(total[index], unit), ", ".join(made), drawn))
+        rows.append((words, amount(budget.total[index], unit), ", ".join(made), drawn))
     return rows
 
 
@@ -227,11 +227,11 @@ def _percent(share: float) -> str:
 def nonlinear_words(budget: Budget) -> Iterator[str]:
     """Say where the linear budget is off by more than 5 %."""
     for row, index in budget.nonlinear():
-        source, unit = budget.sources[row], budget.units[index]
-        linear, actual = budget.sigma[row, index], budget.actual[row, index]
+        unit = budget.units[index]
+        linear = amount(budget.sigma[row, index], unit)
         yield (
-            f"{describe(budget.names[index], budget.imu)}: {source.words} reaches it with "
-            f"{amount(actual, unit)} in the whole fit, {amount(linear, unit)} to first order; its total of "
+            f"{describe(budget.names[index], budget.imu)}: {budget.sources[row].words} reaches it with "
+            f"{amount(budget.actual[row, index], unit)} in the whole fit, {linear} to first order; its total of "
             f"{amount(budget.total[index], unit)} is {_wrong(100 * budget.off[row, index])}."
         )
 

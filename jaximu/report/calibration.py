@@ -99,11 +99,9 @@ def calibration_page(
     `findings`: what else was found, for the first screen.
     """
     trust = [*trust, *words.weak_statements(calibration.weak)]
-    cautions = [statement for statement in trust if statement.caution]
-    settled = [statement for statement in trust if not statement.caution]
 
     def rest() -> Iterator[Part]:
-        yield Section("What to trust", settled)
+        yield Section("What to trust", [statement for statement in trust if not statement.caution])
         yield Section("What is still uncertain", [*uncertainty_parts(calibration)])
         yield Section("What the data cannot show", [*limits()])
         yield from _equations(calibration)
@@ -114,7 +112,12 @@ def calibration_page(
         _title(calibration),
         (*verdict, *_errors(calibration), *_determined(calibration)),
         *(number or _number(calibration)),
-        (*pictures, *findings, Section("Before you rely on it", cautions), *_parameters(calibration)),
+        (
+            *pictures,
+            *findings,
+            Section("Before you rely on it", [statement for statement in trust if statement.caution]),
+            *_parameters(calibration),
+        ),
         rest,
         calibration.notes,
         words.compensation(calibration.files, "applies it") if "accelerometer" in calibration.triads() else "",

@@ -61,10 +61,10 @@ def page_of(
 def _verdict(consequences: Consequences) -> tuple[str, ...]:
     """Say how far position is off at the end, and why."""
     name = _order(consequences)[0]
-    largest, total = _at_end(consequences.terms[name]), _at_end(consequences.total)
+    total = _metres(_at_end(consequences.total))
     return (
-        f"Navigating by this unit alone, position is off by {_metres(total)} (1σ) after {_end(consequences)}.",
-        f"The largest term is {name}: {_metres(largest)} by itself.",
+        f"Navigating by this unit alone, position is off by {total} (1σ) after {_end(consequences)}.",
+        f"The largest term is {name}: {_metres(_at_end(consequences.terms[name]))} by itself.",
     )
 
 
@@ -183,8 +183,7 @@ def _total_rows(consequences: Consequences) -> list[tuple[str, ...]]:
 
 def _statements(consequences: Consequences) -> list[Statement]:
     """Return what the budget means, each with what it is about."""
-    total, end = position(consequences.total), _end(consequences)
-    last = total[-1]
+    last, end = _at_end(consequences.total), _end(consequences)
     parts = [
         f"{name} from {round(start, 1):g} to {round(stop, 1):g} s" for name, start, stop in consequences.dominant()
     ]
@@ -195,14 +194,13 @@ def _statements(consequences: Consequences) -> list[Statement]:
         return _at_end(variances + consequences.noise)
 
     best = min(consequences.known, key=lambda name: better(consequences.known[name]))
-    floor = better(np.zeros_like(consequences.noise))
     buys = (
         f"Were {best} known exactly, the error after {end} would fall from {_metres(last)} to "
         f"{_metres(better(consequences.known[best]))}; with the whole calibration ten times better, to "
         f"{_metres(better(consequences.calibration / 100))}."
     )
     if consequences.noise.any():
-        buys += f" Noise alone leaves {_metres(floor)}, which no calibration can undo."
+        buys += f" Noise alone leaves {_metres(_at_end(consequences.noise))}, which no calibration can undo."
     texts["What a better calibration buys"] = buys
     apart = np.sqrt(sum(_at_end(consequences.terms[name]) ** 2 for name in consequences.known))
     together = _at_end(consequences.calibration)
@@ -224,11 +222,11 @@ def _statements(consequences: Consequences) -> list[Statement]:
             f"budget says after {end} (by chance {1 - chance:.2f} to {1 + chance:.2f})."
         )
     if consequences.against is not None and consequences.apart is not None:
-        other = _at_end(consequences.against.total)
-        off = float(np.linalg.norm(consequences.apart[-1, :3]))
+        other = _metres(_at_end(consequences.against.total))
+        off = _metres(float(np.linalg.norm(consequences.apart[-1, :3])))
         texts["The other calibration"] = (
-            f"With {Path(consequences.against.calibration_file).name} position is off by {_metres(other)} (1σ) after "
-            f"{end} if it is right, and it puts the unit {_metres(off)} from where this one does."
+            f"With {Path(consequences.against.calibration_file).name} position is off by {other} (1σ) after "
+            f"{end} if it is right, and it puts the unit {off} from where this one does."
         )
     return [Statement(about, text) for about, text in texts.items()]
 

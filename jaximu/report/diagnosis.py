@@ -119,10 +119,9 @@ def _what_is_wrong(diagnosis: Diagnosis) -> Iterator[str]:
         sure = "Probably" if all(effect.weak for effect in diagnosis.effects) else "Found"
         yield f"{sure} {_causes(diagnosis)}."
     else:
-        unlikely = diagnosis.p_value <= _DOUBT
         yield (
             "The model does not fit, and no known effect explains why."
-            if unlikely
+            if diagnosis.p_value <= _DOUBT
             else "The model may not fit: of recordings that it describes completely, one in "
             f"{1 / diagnosis.p_value:.0f} looks like this, and no known effect explains it."
         )
@@ -585,10 +584,15 @@ def _learned(learned: LearnedTerm) -> Figure:
         unit, factor = "°/s", np.degrees(1.0)
     scale, label = readable(SENSOR_UNITS[learned.triad], _AN_ERROR)
     figure = figures.new_figure(2.8)
-    x = factor * learned.x - shift
     panels = figure.subplots(1, 3, sharey=True)
     for axis, panel in enumerate(panels):
-        band(panel, x, scale * learned.y[:, axis], scale * learned.half_width[:, axis], _EXTENDED)
+        band(
+            panel,
+            factor * learned.x - shift,
+            scale * learned.y[:, axis],
+            scale * learned.half_width[:, axis],
+            _EXTENDED,
+        )
         zero_line(panel)
         dressed(panel, f"{learned.triad} {'xyz'[axis]}", xlabel=f"{learned.covariate} [{unit.replace('^2', '²')}]")
         panel.xaxis.label.set_size(8)

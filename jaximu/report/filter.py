@@ -42,12 +42,12 @@ def statements(calibration: Calibration, history: History) -> Iterator[Statement
     if (text := calibration.filter.get("diverged")) is not None:
         yield Statement("Diverged", sentence(text), True)
     nis = calibration.filter["nis"]
-    measured = int(np.sum(history.freedom > 0))
     widened = float(np.sqrt(max(calibration.filter.get("noise", {}).values(), default=1.0)))
     fits = 0.7 < nis < 1.4 and text is None and widened < BEYOND
     cause = "noise explains them" if fits else "an unmodelled effect, or the noise stated is not this unit’s"
     text = (
-        f"Over {measured} updates the squared innovations are {number(nis, 2)} times what their uncertainty expects"
+        f"Over {np.sum(history.freedom > 0)} updates the squared innovations are {number(nis, 2)} times what their "
+        "uncertainty expects"
         + (f", once their noise is taken as {number(widened, 2)} times the unit's" if widened >= BEYOND else "")
         + f": {cause}."
     )
@@ -120,9 +120,7 @@ def page_of(calibration: Calibration, history: History) -> Page:
     if "vehicle" in calibration.filter:
         return vehicle_page(calibration, history)
     bias = history.sigmas[-1, _places(history, "gyroscope", "bias")]
-    scale = np.mean(calibration.triads()["gyroscope"].scales)
-    worst = np.degrees(Z95 * max(bias) / scale)
-    minutes = np.ptp(history.time) / 60
+    worst = np.degrees(Z95 * max(bias) / np.mean(calibration.triads()["gyroscope"].scales))
     verdict = "diverged" if calibration.filter.get("diverged") else "followed the unit"
     return calibration_page(
         calibration,
@@ -137,7 +135,7 @@ def page_of(calibration: Calibration, history: History) -> Page:
         ],
         gravity_statements(calibration),
         partial(_limits, calibration, calibration.filter["open"]),
-        (f"The filter {verdict} through {minutes:.1f} min of rests and motion.",),
+        (f"The filter {verdict} through {np.ptp(history.time) / 60:.1f} min of rests and motion.",),
         (f"±{number(worst, 2)} °/s", "how well the gyroscope's bias is known at the end (95 %, the worst axis)"),
         statements(calibration, history),
     )

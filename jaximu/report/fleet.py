@@ -94,8 +94,10 @@ def _next(fleet: Fleet) -> str:
     files = [stranger.file for stranger in fleet.strangers]
     if files:
         return f"`jaximu diagnose {shlex.quote(files[0])} -o RESULTS` shows why the first outlier differs."
-    table = shlex.quote(fleet.table)
-    return f"`jaximu accept {table} --limits LIMITS.toml -o LINE` holds every unit to limits and follows the line."
+    return (
+        f"`jaximu accept {shlex.quote(fleet.table)} --limits LIMITS.toml -o LINE` holds every unit to limits and "
+        "follows the line."
+    )
 
 
 def _outliers(fleet: Fleet, document: str) -> Section:
@@ -246,8 +248,7 @@ def _prior(fleet: Fleet) -> Iterator[Section]:
     alone, prior = (np.quantile(sigma, 0.9, axis=0) for sigma in (fleet.sigma, fleet.shrunk_sigma))
     rows = []
     for k, name in enumerate(fleet.population.names):
-        mean = fleet.population.mean[k] - name.is_scale
-        sizes = (mean, fleet.population.spread[k], alone[k], prior[k])
+        sizes = fleet.population.mean[k] - name.is_scale, fleet.population.spread[k], alone[k], prior[k]
         rows.append((describe(name), *(amount(name, float(size)) for size in sizes)))
     helped = np.flatnonzero(prior < 0.8 * alone).tolist()
     parts: list[Part] = [

@@ -72,9 +72,9 @@ def _verdict(history: UnitHistory) -> Iterator[str]:
     )
     tested = sum(movement.tested for movement in history.movements)
     if moved:
-        words = [_words(movement) for movement in moved[:3]]
+        words = "; ".join(map(_words, moved[:3]))
         rest = f"; and {len(moved) - 3} more" if len(moved) > 3 else ""
-        yield f"{len(moved)} of {tested} numbers moved: {'; '.join(words)}{rest}. All together: {ratio}."
+        yield f"{len(moved)} of {tested} numbers moved: {words}{rest}. All together: {ratio}."
     elif history.verdict == "moved":
         yield f"All numbers together differ by more than their uncertainty ({ratio}), but no single one stands out."
     else:
@@ -118,12 +118,12 @@ def _number(history: UnitHistory) -> tuple[str, str]:
 
 
 def _next(history: UnitHistory) -> str:
-    last = shlex.quote(history.files[-1])
     if not history.limits:
-        names = " ".join(shlex.quote(file) for file in history.files)
+        names = shlex.join(history.files)
         return f"`jaximu compare {names} --limits LIMITS.toml` works out when limits are reached."
     return (
-        f"`jaximu accept {last} --limits {shlex.quote(history.limits_file)}` holds the last calibration to the limits."
+        f"`jaximu accept {shlex.quote(history.files[-1])} --limits {shlex.quote(history.limits_file)}` holds the last "
+        "calibration to the limits."
     )
 
 

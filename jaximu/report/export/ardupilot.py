@@ -88,7 +88,6 @@ def write(parameters: ExportedUnit) -> Written:
     if number not in range(FIRMWARE.sensors):
         raise InputError(f"--instance: ArduPilot names its sensors 0, 1 and 2 here, not {number}.")
     values, equation, corrections, rotation = FIRMWARE.tool(number).values(parameters)
-    rows = [f"{name},{value!r}" for name, value in values]
     convention = (
         "ArduPilot subtracts the offset, then scales, in the sensor's axes; parameters are single precision (6e-8 of a "
         "value), and it refuses scales outside 0.8 to 1.2. "
@@ -97,6 +96,5 @@ def write(parameters: ExportedUnit) -> Written:
         "A DataFlash log holds values that the parameters in force have corrected already (IMU, ACC and GYR alike): "
         "give them (--in-force), unless INS_*OFFS were 0, INS_*SCAL 1 and AHRS_ORIENTATION 0 while recording."
     )
-    text = text_file([comments(parameters), *rows])
-    convention += rotation
-    return Written(text, convention, equation, corrections, parameters=parameters, values=dict(values))
+    text = text_file([comments(parameters), *(f"{name},{value!r}" for name, value in values)])
+    return Written(text, convention + rotation, equation, corrections, parameters=parameters, values=dict(values))

@@ -26,8 +26,8 @@ def write(parameters: ExportedUnit) -> Written:
     for name, triad in parameters.triads.items():
         # signed permutations take standard deviations along without signs
         map_, frame = (np.abs(axes[name]) for axes in (parameters.maps, parameters.frames))
-        sigma = dict(zip(("gain", "bias"), parameters.calibration.sigma(name), strict=True))
-        gain_sigma, bias_sigma = map_.T @ sigma["gain"] @ frame, map_.T @ sigma["bias"]
+        gain_sigma, bias_sigma = parameters.calibration.sigma(name)
+        gain_sigma, bias_sigma = map_.T @ gain_sigma @ frame, map_.T @ bias_sigma
         for index, value in np.ndenumerate(triad.gain):
             add(name, "gain", index, value, float(gain_sigma[index]), f"{triad.unit}/({SENSOR_UNITS[name]})")
         for index, value in np.ndenumerate(triad.bias):

@@ -24,7 +24,7 @@ def write(parameters: ExportedUnit) -> Written:
         if triad is None:
             continue
         view = ImuTk.from_gain(triad.gain, triad.bias)
-        misalignment, scale, bias = (np.asarray(values) for values in (view.misalignment, view.scale, view.bias))
+        misalignment, scale, bias = map(np.asarray, (view.misalignment, view.scale, view.bias))
         parts = (misalignment, np.diag(scale), bias[:, None])
         text = "\n\n".join("\n".join(" ".join(repr(float(cell)) for cell in row) for row in part) for part in parts)
         files[ending] = (text + "\n\n").encode()

@@ -101,8 +101,15 @@ class Composition:
                         shift = scale[axis] * (before - after)
                         at_rest = _at_rest(name, shift, abs(shift) / gravity)
                     half = None if f"{name} {part}" in data_sheet else Z95 * self._sigmas[parameter]
-                    keys = ("parameter", "in_force", "new", "half_width", "at_rest")
-                    changes.append(dict(zip(keys, (parameter, before, after, half, at_rest), strict=True)))
+                    changes.append(
+                        {
+                            "parameter": parameter,
+                            "in_force": before,
+                            "new": after,
+                            "half_width": half,
+                            "at_rest": at_rest,
+                        }
+                    )
         return changes
 
     def at_rest(self) -> dict[str, float]:
@@ -142,7 +149,9 @@ class Composition:
 
     def document(self) -> Json:
         """Return the changes as JSON has them."""
-        return {"file": self.file.path, "composition": self.unit.composition} | {
+        return {
+            "file": self.file.path,
+            "composition": self.unit.composition,
             "changes": self.changes(),
             "at_rest": self.at_rest(),
         }

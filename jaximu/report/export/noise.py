@@ -208,8 +208,7 @@ def _gtsam(
     values: Mapping[str, float], made: Target, integration: float | None, head: Sequence[str], gravity: float
 ) -> dict[str, bytes]:
     """Return a function in Python and one in C++ that make the parameters of combined IMU factors."""
-    units = {key.name: key.unit for key in made.keys}
-    rows = [(key, value, units[key]) for key, value in values.items()]
+    rows = [(key.name, values[key.name], key.unit) for key in made.keys]
     rows.append(("setIntegrationCovariance", 1e-8 if integration is None else integration, "m^2/s"))
     known = _INTEGRATION[:1] if integration is None else _INTEGRATION
     head = [

@@ -22,7 +22,8 @@ def write(parameters: ExportedUnit) -> Written:
         "  ros__parameters:",
         "    imu_calibration:",
     ]
-    for name, correction in parameters.corrections(sensitive=True).items():
+    corrections = parameters.corrections(sensitive=True)
+    for name, correction in corrections.items():
         reference = parameters.calibration.imu.triads()[name].temperature_reference
         lines += [
             f"      {name}:",
@@ -35,5 +36,5 @@ def write(parameters: ExportedUnit) -> Written:
         if np.any(correction.g_sensitivity):
             lines.append(f"        g_sensitivity: {vector_text(correction.g_sensitivity.ravel())}")
     convention = "inverse: u = matrix (y - bias - g_sensitivity f), bias in output units and subtracted first."
-    equation, corrections = parameters.equation("matrix", sensitive=True), parameters.corrections(sensitive=True)
+    equation = parameters.equation("matrix", sensitive=True)
     return Written(text_file(lines), convention, equation, corrections, frozenset({"gyro.g_sensitivity"}))
