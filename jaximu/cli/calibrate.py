@@ -57,11 +57,9 @@ class CalibrateCommand(options.Fits):
                 "--gyro-log": self.log.gyro_log,
                 f"--method {self.method}": self.method.startswith("two-step"),
             }
-            unusable = [name for name, stated in meant.items() if stated]
-            calibration = self._of_means(gravity, unusable)
+            calibration = self._of_means(gravity, [name for name, stated in meant.items() if stated])
         else:
             recordings, known = self.log.read_unit(self.logs, gravity, self.noise)
-            poses = self.poses.value()
             with progress("calibrating"):
                 from jaximu.calibration import calibrate
 
@@ -69,7 +67,7 @@ class CalibrateCommand(options.Fits):
                     recordings,
                     gravity,
                     static=known,
-                    segmentation=poses,
+                    segmentation=self.poses.value(),
                     method=self.method,
                     loss=self.loss,
                     repair=self.repair,

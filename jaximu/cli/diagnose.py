@@ -138,10 +138,15 @@ class DiagnoseCommand(options.Fits):
 
         places_of(list(map(str, self.logs)), pattern)
         recordings, known = self.log.read_unit(self.logs, gravity, self.noise)
-        poses, repair = self.poses.value(), self.repair
         with progress("diagnosing", every=0.0) as report:
             attribution = attribute(
-                recordings, pattern, gravity, report=report, static=known, segmentation=poses, repair=repair
+                recordings,
+                pattern,
+                gravity,
+                report=report,
+                static=known,
+                segmentation=self.poses.value(),
+                repair=self.repair,
             )
         self.results.present(
             attribution.summary, "diagnosis.json and report.html", {}, attribution.text, diagnosis=attribution

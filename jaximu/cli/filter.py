@@ -93,5 +93,4 @@ class FilterCommand(options.Fits):
             else:
                 stated = gravity if self.local != options.LOCAL else None
                 calibration, history = followed_in_use(old, recording, noise_of(known), stated, attitude, compass)
-        page_of = later("report.filter", "page_of")
-        self.results.present(lambda: page_of(calibration, history), calibration=calibration)
+        self.results.present(lambda: later("report.filter", "page_of")(calibration, history), calibration=calibration)

@@ -99,8 +99,9 @@ class MagnetometerCommand(options.Reads):
         )
 
         remarks = [part.text() for part in filter(None, (shift, *diagnosis.causes))]
-        page_of = later("report.magnetometer", "page_of")
-        self.results.present(lambda: page_of(result, measurement, heading, remarks), calibration=result)
+        self.results.present(
+            lambda: later("report.magnetometer", "page_of")(result, measurement, heading, remarks), calibration=result
+        )
 
 
 def _strength(

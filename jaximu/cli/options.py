@@ -557,10 +557,9 @@ def stated_noise(path: Path) -> SensorNoise:
         return read_sensor_noise(path)
     from jaximu.simulation.specification import read_specification
 
-    noise = read_specification(path).case(0).noise
     return {
         name: {process.letter: process.size for process in triad.processes if process.letter}
-        for name, triad in noise.items()
+        for name, triad in read_specification(path).case(0).noise.items()
     }
 
 

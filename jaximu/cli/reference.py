@@ -63,8 +63,9 @@ class ReferenceCommand(options.Fits):
                 repair=self.repair,
                 **options.effects_of(self.effect),
             )
-        page_of = later("report.attitude", "page_of")
-        self.results.present(lambda: page_of(calibration, measurement), calibration=calibration)
+        self.results.present(
+            lambda: later("report.attitude", "page_of")(calibration, measurement), calibration=calibration
+        )
 
 
 def read_reference(path: Path, log_path: Path, recording: Recording) -> Attitude:

@@ -124,9 +124,10 @@ def _scatter(value: float | None, factor: float) -> str:
 def _figure(array: Array) -> Figure:
     figure = new_figure(4.6)
     panels = figure.subplots(1, 2)
-    extent = max(np.ptp(np.array([unit.position for unit in array.units]), axis=0).max(), 5e-3)
+    positions = np.array([unit.position for unit in array.units])
+    extent = max(np.ptp(positions, axis=0).max(), 5e-3)
     for panel, (across, up), title in zip(panels, ((0, 1), (0, 2)), ("From above", "From the side"), strict=True):
-        places = np.array([unit.position for unit in array.units])[:, [across, up]]
+        places = positions[:, [across, up]]
         for unit in array.units:
             _draw(panel, unit, across, up, 1e3 * 0.12 * extent, unit is array.units[0])
         for row, position in enumerate(places):  # one label for units that lie upon each other

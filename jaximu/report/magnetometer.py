@@ -56,11 +56,11 @@ def statements(calibration: Calibration) -> Iterator[Statement]:
     """Say what the field is, what the iron does, and where the field was seen."""
     facts, triad = calibration.magnetic, calibration.imu.magnetometer
     assert facts is not None and triad is not None
-    gain, bias = np.asarray(triad.gain), np.asarray(triad.bias)
+    gain = np.asarray(triad.gain)
     strength, dip = facts["field"]["strength"], facts["field"]["dip"]
     # a field's image is an ellipsoid; how far from round it is, is soft iron and scale
     axes = np.linalg.svd(gain, compute_uv=False)
-    iron = float(np.linalg.norm(np.linalg.solve(gain, bias)))
+    iron = float(np.linalg.norm(np.linalg.solve(gain, np.asarray(triad.bias))))
     text = f"{number(strength['value'], 3)} ± {number(Z95 * strength['sigma'], 2)} µT"
     if dip is not None:
         way = "below" if dip["value"] > 0 else "above"

@@ -79,8 +79,9 @@ def _scaled(values: FloatArray, digits: int = 7) -> tuple[str, list[list[str]]]:
     size = int(np.floor(np.log10(np.abs(values).max(initial=1e-300))))
     power = 0 if -2 <= size <= 5 else size
     decimals = max(0, digits - 1 - (size - power))
-    scaled = values / 10.0**power
-    cells = [[f"{value:.{decimals}f}".replace("-", "−") if value else "0" for value in row] for row in scaled]
+    cells = [
+        [f"{value:.{decimals}f}".replace("-", "−") if value else "0" for value in row] for row in values / 10.0**power
+    ]
     return f"10{raised(power)} ·" if power else "", cells
 
 

@@ -85,8 +85,7 @@ def _print_table(table: Table, screen: Console) -> None:
     columns = list(zip(*([table.headers] if table.headers else []), *table.rows, strict=True))
     words = [max((len(word) for cell in column for word in cell.split()), default=1) for column in columns]
     widths = [max((len(line) for cell in column for line in cell.split("\n")), default=1) for column in columns]
-    room = screen.width - 2 * len(widths)
-    if sum(words) > room:
+    if sum(words) > screen.width - 2 * len(widths):
         _print_stacked(table, screen)
     else:
         _print_grid(table, words, widths, screen)

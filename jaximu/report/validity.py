@@ -82,11 +82,10 @@ def _shifts_table(validity: Validity) -> Table:
     """Return each parameter's old value, its shift, and that in the output, the most significant first."""
     statistic, freedom, p_value = validity.difference
     together = f"All {freedom} together: χ² {statistic:.1f}, p {probability(p_value)}." if freedom else ""
-    shifts = sorted(validity.shifts, key=_rank)
     moved = range(len(validity.moved))
     return Table(
         ("parameter", "old", "shift ± 95 %", "in the output ± 95 %", "σ", "p-value, all allowed for"),
-        [_shift_row(shift) for shift in shifts],
+        [_shift_row(shift) for shift in sorted(validity.shifts, key=_rank)],
         together,
         moved,
         brief=max(3, len(moved)),

@@ -106,7 +106,7 @@ def scatter_statements(calibration: Calibration) -> list[Statement]:
     freedom = {name: max(left, 1) for name, left in conditions.items()}
     for name, (about, subject, causes) in _SCATTER.items():
         excess = calibration.excess.get(name)
-        if excess is None or (name == "turns" and not counts(calibration)[1]):
+        if excess is None or (name == "turns" and not turns):
             continue
         times = np.sqrt(1 + excess)
         large = times >= BEYOND

@@ -174,8 +174,7 @@ def _header(types: Any, stamp: int) -> Any:
 def _status(calibration: Calibration, types: Any, stamp: int) -> bytes:
     """Return the message that says which calibration it is, and the verdict of its diagnosis if there was one."""
     known = types.types
-    diagnosis = calibration.diagnosis or {}
-    verdict = str(diagnosis.get("verdict", "not diagnosed"))
+    verdict = str((calibration.diagnosis or {}).get("verdict", "not diagnosed"))
     level = 0 if verdict in ("adequate", "effects") else 1
     facts = {
         "verdict": verdict,
