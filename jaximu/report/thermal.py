@@ -237,7 +237,8 @@ def _coefficient_rows(title: str, entry: Json) -> list[tuple[str, ...]]:
 
 def _largest_change(calibration: Calibration, owner: str, plain: str) -> tuple[str, ...]:
     """Return the largest change of steady bias that an effect makes over the range, ± 95 %, by axis, and the unit."""
-    temperature = np.linspace(*calibration.data["temperature_range"], 101)
+    low, high = calibration.data["temperature_range"]
+    temperature = np.linspace(low, high, 101)
     scale = calibration.triads()[owner].scales
     value, sigma = (values / scale for values in change(calibration, owner, (plain,), temperature))
     rows = np.argmax(np.abs(value), axis=0), np.arange(3)

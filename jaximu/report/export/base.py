@@ -33,7 +33,7 @@ class LinearTriad:
     @property
     def inverse(self) -> FloatArray:
         """(3, 3) SI units per unit of y."""
-        return np.linalg.inv(self.gain)
+        return np.asarray(np.linalg.inv(self.gain), np.float64)
 
 
 @dataclass(frozen=True)

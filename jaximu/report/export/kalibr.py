@@ -40,7 +40,9 @@ def write(parameters: ExportedUnit) -> Written:
         *yaml_matrices({"M": accel}, 4, 4),
         f"    bias: {accel_bias}",
     ]
-    corrections = {"accelerometer": Correction(np.linalg.inv(accel), view["accel_bias"], frame=frame)}
+    corrections = {
+        "accelerometer": Correction(np.asarray(np.linalg.inv(accel), np.float64), view["accel_bias"], frame=frame)
+    }
     equation = f"f = inverse(M) (y - b)\nM = {matrix_text(accel)}\nb = {accel_bias}"
     if "gyroscope" in parameters.triads:
         gyro, rotation, sensitivity = view["gyro_matrix"], view["gyro_rotation"], view["g_sensitivity"]
