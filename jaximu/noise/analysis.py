@@ -167,8 +167,7 @@ def _by_temperature(recording: Recording, name: str) -> list[str]:
     edges = np.linspace(0, len(signal), _SLOW + 1).astype(int)
     if celsius is None or len(signal) < 2 * _SLOW:
         return []
-    temperature = np.interp(signal.time, celsius.time, celsius.values[:, 0])
-    values = np.column_stack([signal.si(), temperature])
+    values = np.column_stack([signal.si(), np.interp(signal.time, celsius.time, celsius.values[:, 0])])
     *means, warmth = (np.add.reduceat(values, edges[:-1], axis=0) / np.diff(edges)[:, None]).T
     if np.ptp(warmth) < _WARMED:
         return []

@@ -158,8 +158,7 @@ def _peaks(values: FloatArray, last: int | None) -> list[tuple[int, int, int]]:
     if not len(high):
         return []
     middle = np.log(np.sqrt((edges[:-1] + 1.0) * edges[1:]))
-    level = np.exp(np.interp(np.log(high + 1.0), middle, np.log(median)))
-    high = high[power[high] > factor * level]
+    high = high[power[high] > factor * np.exp(np.interp(np.log(high + 1.0), middle, np.log(median)))]
     peaks = []
     for group in np.split(high, 1 + np.flatnonzero(np.diff(high) > 6)):
         if len(group):
@@ -208,8 +207,7 @@ def _wave(values: FloatArray, peak: int, rate: float) -> tuple[PeriodicLine, Flo
     taper = 0.5 - 0.5 * np.cos(2 * np.pi * (index + 0.5) / samples)
     size = max(1, samples // 4096)
     blocks = samples // size
-    mixed = values * turn * taper
-    coarse = mixed[: blocks * size].reshape(blocks, size).sum(axis=1)
+    coarse = (values * turn * taper)[: blocks * size].reshape(blocks, size).sum(axis=1)
     middle = (np.arange(blocks) * size + (size - 1) / 2) / samples
 
     def height(shift: float) -> float:

@@ -82,8 +82,7 @@ class FilterNumbers:
     flat: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        numbers = {"rate": self.rate, "white": self.white, "walk": self.walk, "sigma": self.sigma}
-        for name, value in numbers.items():
+        for name, value in {"rate": self.rate, "white": self.white, "walk": self.walk, "sigma": self.sigma}.items():
             if not (math.isfinite(value) and value >= 0):
                 raise InputError(f"{name} must be finite and must not be negative, found {value}.")
         if self.quantity not in SI_UNITS:

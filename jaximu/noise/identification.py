@@ -286,8 +286,7 @@ class _Spectrum:
     def products(self, left: FloatArray, right: FloatArray) -> FloatArray:
         """Means over bins (B,) of products of coefficients given at the lowest places (J,)."""
         kept = self.inside >= 0
-        sums = np.bincount(self.inside[kept], (left * right)[kept], minlength=len(self.count))
-        return sums / self.count
+        return np.bincount(self.inside[kept], (left * right)[kept], minlength=len(self.count)) / self.count
 
     def ramp(self) -> FloatArray:
         """Coefficients (J,) of a ramp of slope one per second, √density."""
@@ -391,8 +390,7 @@ def _markov(spectrum: _Spectrum, correlation_time: float) -> FloatArray:
     half = spectrum.angle / 2
     gap = 2 * np.sinh(p / 2) ** 2 + 2 * np.sin(half) ** 2
     # single places are even or odd; among many the signs cancel
-    single = spectrum.node == np.round(spectrum.node)
-    sign = np.where(single, np.where(spectrum.node % 2 == 0, 1.0, -1.0), 0.0)
+    sign = np.where(spectrum.node == np.round(spectrum.node), np.where(spectrum.node % 2 == 0, 1.0, -1.0), 0.0)
     ends = 1 - sign * np.exp(-p * spectrum.samples)
     edge = 4 / spectrum.samples * np.sinh(p / 2) ** 2 * np.cos(half) ** 2 * ends / gap**2
     return (np.sinh(p) / gap - edge) / spectrum.rate
@@ -431,8 +429,7 @@ class _Model:
     @cached_property
     def columns(self) -> FloatArray:
         """Mean density (B, letters) of the coefficients of each letter's term of size one."""
-        columns = [self.spectrum.columns[term] for term in self.letters]
-        return np.reshape(columns, (-1, len(self.spectrum.count))).T
+        return np.reshape([self.spectrum.columns[term] for term in self.letters], (-1, len(self.spectrum.count))).T
 
     @cached_property
     def drift(self) -> FloatArray:
@@ -471,8 +468,7 @@ class _Model:
             log_variance, log_time = theta[count + 2 * i : count + 2 * i + 2]
             spectrum, step = self.spectrum, 1e-4
             below, above = (_markov(spectrum, np.exp(log_time + s)) @ _WEIGHT for s in (-step, step))
-            here = (below + above) / 2
-            parts.append(np.exp(log_variance) * np.stack([here, (above - below) / (2 * step)], axis=1))
+            parts.append(np.exp(log_variance) * np.stack([(below + above) / 2, (above - below) / (2 * step)], axis=1))
         shares = np.concatenate(parts, axis=1)
         processes = [*range(count), *range(count, shares.shape[1], 2)]
         variance = np.maximum(shares[:, processes].sum(axis=1), 1e-300)
@@ -490,8 +486,7 @@ class _Model:
 
     def residual(self, sizes: FloatArray) -> FloatArray:
         """Mean squares (B,) about the drifts."""
-        power = self.power - 2 * self.cross @ sizes + np.einsum("bij,i,j->b", self.gram, sizes, sizes)
-        return np.maximum(power, 0.0)
+        return np.maximum(self.power - 2 * self.cross @ sizes + np.einsum("bij,i,j->b", self.gram, sizes, sizes), 0.0)
 
     def start(self) -> FloatArray:
         """Each term as large as no octave forbids."""
@@ -611,8 +606,7 @@ def _select(general: _Model, terms: str) -> _Fit:
     criterion is then Akaike's (H. Akaike, IEEE Trans. Autom. Control 19, 1974), two for every term.
     """
     best, chosen = np.inf, None
-    smallest = 0 if general.times else 1
-    for size in range(smallest, len(terms) + 1):
+    for size in range(0 if general.times else 1, len(terms) + 1):
         for subset in combinations(terms, size):
             if set(subset) == {"R"} and not general.times:
                 continue  # a ramp alone has no noise
@@ -631,8 +625,7 @@ def _excess(general: _Fit, freedom: int) -> float:
     """Return the share by which octaves differ from the most general model, so that its misfit is its freedom."""
 
     def over(logarithm: float) -> float:
-        model = replace(general.model, excess=float(np.exp(logarithm)))
-        return model.fit().misfit()[0] - freedom
+        return replace(general.model, excess=float(np.exp(logarithm))).fit().misfit()[0] - freedom
 
     low, high = np.log(1e-3), np.log(2.0)
     if over(low) <= 0:

@@ -108,14 +108,12 @@ def windows_at_rest(time: FloatArray, rests: FloatArray, rate: float) -> tuple[I
     width -= width % 16  # transforms of round lengths are quick
     if width < 4 * _SIDE:
         return np.zeros(0, np.int64), width
-    counts = np.diff(spans)[:, 0] // width
     starts = [
         first + (last - first - count * width) // 2 + width * np.arange(count)
-        for (first, last), count in zip(spans, counts, strict=True)
+        for (first, last), count in zip(spans, np.diff(spans)[:, 0] // width, strict=True)
     ]
     first = np.concatenate(starts).astype(np.int64)
-    even = np.abs((time[first + width - 1] - time[first]) * rate - (width - 1)) < 1
-    return first[even], width
+    return first[np.abs((time[first + width - 1] - time[first]) * rate - (width - 1)) < 1], width
 
 
 def follow(parts: FloatArray, times: FloatArray, rate: float) -> list[SpectralLine]:
@@ -196,8 +194,7 @@ def _beside(power: FloatArray) -> FloatArray:
     after = np.where(above <= last - side, beside[np.minimum(above, last - side)], 0.0)
     shape = np.maximum(beside[np.maximum(below, 0)], after)
     rise = shape[first] * (first / np.maximum(index[:first], 1)) ** 2
-    itself = usual(2 * _OVER + 1)[np.maximum(index[:first] - _OVER, 0)]
-    shape[:first] = np.minimum(rise, itself)
+    shape[:first] = np.minimum(rise, usual(2 * _OVER + 1)[np.maximum(index[:first] - _OVER, 0)])
     return level * shape
 
 
@@ -269,10 +266,8 @@ def _size(
 ) -> float:
     """Return the amplitude of a line, its drift within the windows (k, w) undone, and noise taken off its power."""
     time = (np.arange(tapered.shape[1]) - (tapered.shape[1] - 1) / 2) / rate
-    drift = np.gradient(frequency, times)
-    phase = 2 * np.pi * (frequency[:, None] * time + drift[:, None] * time**2 / 2)
-    height = np.abs(dot_rows(tapered, np.exp(-1j * phase)))
-    return float(2 * root_or_zero(np.mean((height**2 - noise)[visible])))
+    phase = 2 * np.pi * (frequency[:, None] * time + np.gradient(frequency, times)[:, None] * time**2 / 2)
+    return float(2 * root_or_zero(np.mean((np.abs(dot_rows(tapered, np.exp(-1j * phase))) ** 2 - noise)[visible])))
 
 
 def swing(values: FloatArray, time: FloatArray, line: SpectralLine) -> tuple[float, float]:
@@ -283,8 +278,7 @@ def swing(values: FloatArray, time: FloatArray, line: SpectralLine) -> tuple[flo
     """
     centred = time - time.mean()
     length = len(time) * (time[1] - time[0])
-    frequency = np.interp(time, line.times, line.frequency)
-    drift, middle = np.polyfit(centred, frequency, 1)
+    drift, middle = np.polyfit(centred, np.interp(time, line.times, line.frequency), 1)
     hidden, half_range = _LOBE * line.resolution, _OFF / length
     if np.abs(middle - line.rate * np.round(middle / line.rate)) < hidden:
         half_range = max(half_range, hidden)
@@ -295,8 +289,7 @@ def swing(values: FloatArray, time: FloatArray, line: SpectralLine) -> tuple[flo
     rows = np.stack([np.ones_like(turns), np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)], axis=1)
     level = values.mean()
     noise = float(np.mean(np.diff(values) ** 2) / 2)
-    information = rows @ rows.swapaxes(1, 2) / noise + np.diag([0.0, 2.0, 2.0]) / line.size**2
-    covariance = np.linalg.inv(information)
+    covariance = np.linalg.inv(rows @ rows.swapaxes(1, 2) / noise + np.diag([0.0, 2.0, 2.0]) / line.size**2)
     score = rows @ (values - level) / noise
     estimate = np.einsum("gij,gj->gi", covariance, score)
     weight = np.einsum("gi,gi->g", estimate, score) / 2 + np.linalg.slogdet(covariance)[1] / 2

@@ -294,8 +294,7 @@ def carried(
     at_rest = np.concatenate([rate[a:b] for a, b in np.searchsorted(rate_time, rests)])
     rate = rate - np.median(at_rest, axis=0) if len(at_rest) else rate
     angle = np.cumulative_sum(turned_between(rate_time, rate), axis=0, include_initial=True)
-    stamps = np.linspace(middle[used], middle[used + 1], _TURN_STEPS + 1)
-    passed = interpolated(rate_time, angle, stamps)
+    passed = interpolated(rate_time, angle, np.linspace(middle[used], middle[used + 1], _TURN_STEPS + 1))
     steps = passed[1:] - passed[:-1]
     factors = np.concatenate([_FACTORS, -_FACTORS])
     turns = Rotation.from_rotvec((factors[:, None, None, None] * steps).reshape(-1, 3)).as_matrix()
@@ -337,8 +336,7 @@ def _jumps(force: FloatArray, before: FloatArray, after: FloatArray) -> bool:
 
 def _levers(blocks: BlockMeans) -> FloatArray:
     """The weighted f × e_k (n, 3, 3), k the last index."""
-    weighted = blocks.weight[:, None] * blocks.force
-    return np.cross(weighted[:, None], np.eye(3)).swapaxes(1, 2)
+    return np.cross((blocks.weight[:, None] * blocks.force)[:, None], np.eye(3)).swapaxes(1, 2)
 
 
 def _accelerometer_columns(blocks: BlockMeans, rate: FloatArray) -> FloatArray:

@@ -245,8 +245,7 @@ def entries_of_columns(recording: Recording) -> list[ScheduleEntry]:
 
 def _rests(time: FloatArray, moved: FloatArray, where: str) -> FloatArray:
     """Intervals (n, 2) over which the reference rests; `moved` (n,) is its rate at each stamp, its noise included."""
-    limit = np.clip(_NOISY * floor_of(moved), _STILL, _MOVING)
-    runs = runs_of(moved < limit)
+    runs = runs_of(moved < np.clip(_NOISY * floor_of(moved), _STILL, _MOVING))
     spans = np.stack([time[runs[:, 0]] + _WINDOW, time[runs[:, 1] - 1] - _WINDOW], axis=1)
     spans = spans[spans[:, 1] - spans[:, 0] >= _SHORTEST]
     if not len(spans):
@@ -275,8 +274,7 @@ def _entries_of_attitude(recording: Recording, attitude: Signal) -> list[Schedul
     spans = _rests(attitude.time, angle / (attitude.time[after] - attitude.time[before]), recording.name)
     entries: list[ScheduleEntry] = []
     for index, (start, stop) in enumerate(spans):
-        inside = (attitude.time >= start) & (attitude.time <= stop)
-        up = rotation[inside].inv().apply([0.0, 0.0, 1.0]).mean(axis=0)
+        up = rotation[(attitude.time >= start) & (attitude.time <= stop)].inv().apply([0.0, 0.0, 1.0]).mean(axis=0)
         entries.append(ScheduleEntry(start, stop, "pose", up / np.linalg.norm(up)))
         if index + 1 < len(spans) and (following := spans[index + 1, 0]) - stop < _LONGEST_TURN:
             during = rotation[(attitude.time >= stop) & (attitude.time <= following)]
@@ -291,8 +289,7 @@ def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray)
     before, after = _neighbours(len(time), _WINDOW / np.median(np.diff(time)) / 2)
     moved = np.abs(angle[after] - angle[before]) / (time[after] - time[before])
     if recording.gyroscope is not None:  # a unit is mounted again while the table stands
-        rate = Integral(recording.gyroscope)
-        mean = rate.over(time[before], time[after]) / (time[after] - time[before])[:, None]
+        mean = Integral(recording.gyroscope).over(time[before], time[after]) / (time[after] - time[before])[:, None]
         off = lengths_of(mean - np.median(mean[moved < _STILL], axis=0))
         moved = np.where(off > _MOVING, np.inf, moved)
     spans = _rests(time, moved, recording.name)

@@ -91,15 +91,13 @@ class Moments:
         count = last - first
         safe = np.maximum(count, 2)
         mean, square = ((sums[:, last] - sums[:, first]) / safe for sums in (self._sums, self._squares))
-        variance = (square - mean**2) * (safe / (safe - 1))
-        return (mean + self._origin).T, np.maximum(variance, 0.0).T, count
+        return (mean + self._origin).T, np.maximum((square - mean**2) * (safe / (safe - 1)), 0.0).T, count
 
 
 def _windows(moments: Moments, centres: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
     """Mean (W, 3) and summed variance (W,) over windows around `centres`; a gap is not rest."""
     mean, variance, count = moments.between(centres - width / 2 - 1e-9, centres + width / 2 - 1e-9)
-    enough = count >= max(3, 0.5 * width * moments.signal.rate)
-    return mean, np.where(enough, variance.sum(axis=1), np.inf)
+    return mean, np.where(count >= max(3, 0.5 * width * moments.signal.rate), variance.sum(axis=1), np.inf)
 
 
 def _floor(variance: FloatArray, moments: Moments) -> float:
@@ -108,8 +106,7 @@ def _floor(variance: FloatArray, moments: Moments) -> float:
     # Quantised output can be constant at rest; then a step's rounding variance is the least that can be claimed. And
     # simulated output without noise is constant but for the rounding of the running sums.
     total = moments.between(np.array([-np.inf]), np.array([np.inf]))[1].sum()
-    rounding = np.finfo(np.float64).eps * len(moments.signal) * total
-    return max(floor, moments.signal.rounding_variance, rounding)
+    return max(floor, moments.signal.rounding_variance, np.finfo(np.float64).eps * len(moments.signal) * total)
 
 
 def _angles(vectors: FloatArray, others: FloatArray) -> FloatArray:
@@ -218,8 +215,7 @@ def find_stops(recording: Recording) -> Segmentation | None:
     """
     scan = _Scan.of(recording, _STOP_WINDOW)
     force = scan.means[0]
-    middle = np.median(force, axis=0)
-    turned = np.mean(_angles(force, np.broadcast_to(middle, force.shape)) > _UPRIGHT)
+    turned = np.mean(_angles(force, np.broadcast_to(np.median(force, axis=0), force.shape)) > _UPRIGHT)
     limits = (_STEADY, SegmentationOptions.rate_limit)  # of force and rate; beyond either the unit moves
     off = [lengths_of(mean - np.median(mean, axis=0)) for mean in scan.means]
     moving = np.mean([values > limit for values, limit in zip(off, limits, strict=False)], axis=1).max()
@@ -259,8 +255,7 @@ def _why_no_poses(intervals: FloatArray, duration: float, force: FloatArray, not
         "A calibration needs at least nine orientations: hold the unit still for two seconds or more in each, and turn "
         "it between them."
     )
-    middle = np.median(force, axis=0)
-    alternating = np.insert(force, np.arange(1, len(force)), middle, axis=0)
+    alternating = np.insert(force, np.arange(1, len(force)), np.median(force, axis=0), axis=0)
     off = _angles(alternating[:-1], alternating[1:]) if len(force) > 1 else np.zeros(1)
     if np.quantile(off, 0.99) < _DISTINCT and np.sum(np.diff(intervals)) > 0.5 * duration:
         return (
@@ -276,8 +271,7 @@ def _turning(rate: FloatArray, ratio: FloatArray, limit: float) -> FloatArray:
     quiet = ratio < 4
     if quiet.sum() < 4:
         return np.zeros(len(rate))
-    bias = np.median(rate[quiet], axis=0)
-    deviation = lengths_of(rate - bias)
+    deviation = lengths_of(rate - np.median(rate[quiet], axis=0))
     return deviation / max(limit, 6 * np.median(deviation[quiet]))
 
 

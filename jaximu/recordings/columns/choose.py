@@ -44,8 +44,7 @@ def column_units(
         if missing and len(missing) < len(group.columns):
             present = ", ".join(name for name in group.columns if name in used)
             raise InputError(f"{table.path}: column {missing[0]} is missing beside {present}.")
-        units = {used[name][1].quantity for name in group.columns} if not missing else set()
-        if len(units) > 1:
+        if not missing and len({used[name][1].quantity for name in group.columns}) > 1:
             raise InputError(f"{table.path}: columns {', '.join(group.columns)} mix raw counts with physical units.")
     return used
 

@@ -682,8 +682,7 @@ class _Guess:
             self.chosen[time] = Column(TIME, self.fields[time].unit)
             return slope
         label, options, step = self.table.label(time), self._time_units(), self._step()
-        values = np.asarray(self.numbers[time])
-        if len(options) == 1 and np.all(np.diff(values) == 1.0) and not self.table.rate:
+        if len(options) == 1 and np.all(np.diff(np.asarray(self.numbers[time])) == 1.0) and not self.table.rate:
             options = []  # rows counted from the first on
         if len(options) > 1 and slope is not None and gyro is not None:
             stated = find_unit(gyro.unit or "", "angular rate")
@@ -847,8 +846,7 @@ class _Guess:
 
     def _lone_magnetometer(self) -> Advice:
         columns = [c if (c.name or "").startswith(("mag_", "time")) else Column(None) for c in self.columns]
-        stated = header_columns(self.table) or ()
-        known = any(column.name == "mag_x" and column.unit for column in stated)
+        known = any(column.name == "mag_x" and column.unit for column in header_columns(self.table) or ())
         text = None if known else column_text(columns)
         option = f" --columns '{text}'" if text else ""
         return Advice(

@@ -215,8 +215,7 @@ def whole_stamps(table: LogTable) -> LogTable:
             names = [*table.header]
             names[at] = JOINED
             joined = table.with_column(at, written * 10**9 + table.columns[rest] * (10**9 // parts))
-            note = f"time is {table.label(at)} and {table.label(rest)}."
-            return replace(joined, names=tuple(names)).noted(note)
+            return replace(joined, names=tuple(names)).noted(f"time is {table.label(at)} and {table.label(rest)}.")
     return table
 
 

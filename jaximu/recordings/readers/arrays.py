@@ -55,8 +55,7 @@ def table_of(variables: Mapping[str, Any], source: Source) -> LogTable:
         count = array.shape[1]
         axes = _AXES.get(count, tuple(map(str, range(count))))
         for axis, column in zip(axes, array.T, strict=True):
-            title = base if count == 1 else f"{base}_{axis}"
-            names.append(column_title(title, unit))
+            names.append(column_title(base if count == 1 else f"{base}_{axis}", unit))
             columns.append(np.ascontiguousarray(column, np.float64 if column.dtype.kind == "f" else np.int64))
     return LogTable(source, tuple(names), tuple(columns), rate=rate)
 

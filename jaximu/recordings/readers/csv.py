@@ -223,8 +223,7 @@ _STYLES = [(delimiter, decimal) for decimal, order in ((".", "\t,; |"), (",", ";
 
 def _layout(data: bytes, path: str) -> _Layout:
     """Delimiter, decimal sign, header and first line of data: data is what most of the first lines look like."""
-    raw = data[:HEAD].split(b"\n", _LOOKED_AT)
-    lines = [_text(line) for line in raw[:_LOOKED_AT]]
+    lines = [_text(line) for line in data[:HEAD].split(b"\n", _LOOKED_AT)[:_LOOKED_AT]]
     ruled = [(at, line) for at, line in enumerate(lines) if not _RULE.fullmatch(line)]
     filled = [(at, line) for at, line in ruled if not line.lstrip().startswith(_MARKS)]
     if not filled:

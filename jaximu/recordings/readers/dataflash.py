@@ -64,8 +64,7 @@ def read(path: Path, source: Source, options: ReadOptions) -> tuple[LogTable, ..
         heat = rows["IMU", instance]
         tables.append(_table(source, heat[:, 0], {"temperature [degC]": heat[:, -1]}))
     sensors = {"accelerometer": instance, "gyroscope": instance}
-    first = replace(tables[0], notes=tuple(notes), frame="FRD", corrected=True, sensors=sensors)
-    return first, *tables[1:]
+    return replace(tables[0], notes=tuple(notes), frame="FRD", corrected=True, sensors=sensors), *tables[1:]
 
 
 def parameters(path: Path) -> list[tuple[str, float]]:

@@ -69,8 +69,7 @@ def _sample(shapes: list[str]) -> tuple[str, ...] | None:
 
 def _of(data: bytes) -> tuple[str, ...] | None:
     """The shapes of a sample's lines in printed text, None where the text is a table or something else."""
-    lines = _text(data)[:_LOOKED_AT]
-    sample = _sample([_shape(line) for line in lines[:-1]])
+    sample = _sample([_shape(line) for line in _text(data)[:_LOOKED_AT][:-1]])
     if sample is None or sum(line.count("#") for line in sample) < _FEWEST:
         return None
     labels = sum(len(_LABELLED.findall(line)) for line in sample)
@@ -210,8 +209,7 @@ def read(data: bytes, source: Source) -> LogTable:
     elif sentence := _SENTENCE.match(sample[0]):
         from jaximu.recordings.columns.known import sentence_names
 
-        known = sentence_names(sentence[1], len(names) - 1)
-        names = ["time [s]", *(known or [""] * (len(names) - 1))]
+        names = ["time [s]", *(sentence_names(sentence[1], len(names) - 1) or [""] * (len(names) - 1))]
         note = f"a terminal program's time stands before each {sentence[1]} sentence."
     elif "@" in sample[0] and "->" in sample[0]:
         note = "a serial monitor's time of day and arrow (->) stand before the values."

@@ -192,8 +192,7 @@ def _alike(options: ReadOptions, table: LogTable) -> ReadOptions:
 
 def _of_two_files(options: ReadOptions, table: LogTable) -> bool:
     """Whether the columns are those of this file and of the gyroscope's."""
-    names = parse_columns(options.columns or ())
-    return options.gyro_columns is not None or len(names) > len(table.columns)
+    return options.gyro_columns is not None or len(parse_columns(options.columns or ())) > len(table.columns)
 
 
 def _counts(options: ReadOptions, name: str) -> tuple[Stated | None, Stated | None]:
@@ -295,8 +294,7 @@ def read_means(path: FilePath, options: ReadOptions | None = None) -> PoseMeans:
     """
     options = replace(options or ReadOptions(), rate=1.0)
     table = read_table(path)
-    chosen = choose_columns(table, options.columns)
-    columns = [Column(None) if column.name == TIME else column for column in chosen]
+    columns = [Column(None) if column.name == TIME else column for column in choose_columns(table, options.columns)]
     part = extract(table, columns, options, {"accel", "gyro"})
     recording = _finished([replace(part, notes=table.notes)], table, replace(options, rate=None))
     triads = {"accel": recording.accelerometer, "gyro": recording.gyroscope}
@@ -573,8 +571,7 @@ def extract(
         else Column(None)
         for column, title in zip(columns, table.header, strict=True)
     ]
-    sensor = "gyro" if option == "--gyro-columns" else None
-    used = column_units(table, wanted, option, sensor)
+    used = column_units(table, wanted, option, "gyro" if option == "--gyro-columns" else None)
     for put_right in (_stamped, _carried_on, _ordered if table.messages else _rising) if TIME in used else ():
         table = put_right(table, *used[TIME])
     stamps, origin, notes = _stamps(table, used, options)

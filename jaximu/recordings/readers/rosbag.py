@@ -261,8 +261,7 @@ class _Columns:
             numbers[here] = np.ascontiguousarray(rows[:, length - 8 * self.kind.doubles :]).view("<f8")[
                 :, self.kind.used
             ]
-        header = stamps[:, 0] * 10**9 + stamps[:, 1]
-        self.blocks.append((header, np.array(self.received, np.int64), numbers))
+        self.blocks.append((stamps[:, 0] * 10**9 + stamps[:, 1], np.array(self.received, np.int64), numbers))
         self.received, self.data = [], []
 
     def table(self, source: Source, topic: str, wanted: dict[str, int], stamp: str) -> LogTable | None:

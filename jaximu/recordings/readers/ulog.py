@@ -140,8 +140,7 @@ def read(path: Path, source: Source, options: ReadOptions) -> tuple[LogTable, ..
         if field in logged[name, instance]
     }
     corrected = topic in ("sensor_combined", "vehicle_imu")
-    first = replace(tables[0], notes=tuple(notes), frame="FRD", corrected=corrected, sensors=sensors)
-    return first, *tables[1:]
+    return replace(tables[0], notes=tuple(notes), frame="FRD", corrected=corrected, sensors=sensors), *tables[1:]
 
 
 def parameters(path: Path) -> Iterator[tuple[str, float]]:
