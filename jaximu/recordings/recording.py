@@ -9,6 +9,7 @@ import re
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from itertools import combinations
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -408,13 +409,12 @@ def same_outputs(recordings: Sequence[Recording], alone: bool = False) -> tuple[
                 )
             if a is not None and (a.unit != b.unit or not np.allclose(a.nominal_scale, b.nominal_scale, rtol=0.2)):
                 raise InputError(f"{first.name} and {other.name} give the {name} in different units or scales.")
-    for at, other in enumerate(recordings):
-        for before in recordings[:at]:
-            signals = before.signals
-            if signals.keys() == other.signals.keys() and all(
-                np.array_equal(signals[name].values, signal.values) for name, signal in other.signals.items()
-            ):
-                raise InputError(f"{other.name} is the same recording as {before.name}: name it once.")
+    for before, other in combinations(recordings, 2):
+        signals = before.signals
+        if signals.keys() == other.signals.keys() and all(
+            np.array_equal(signals[name].values, signal.values) for name, signal in other.signals.items()
+        ):
+            raise InputError(f"{other.name} is the same recording as {before.name}: name it once.")
     axes = [None if recording.reading is None else str(recording.reading.maps) for recording in recordings]
     return tuple(
         f"{recording.name} was read in other axes than {first.name}, whose reading the calibration keeps."
@@ -541,7 +541,7 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
         return ()
     peak = np.percentile(lengths_of(gyroscope.si()), 99.0)
     assert recording.turning is not None
-    slope, correlation = recording.turning.slope, recording.turning.correlation
+    *_, slope, correlation = recording.turning
     if abs(correlation) > CORRELATED and not 1.0 / 3.0 < abs(slope) < 3.0:
         raise InputError(
             f"{where}: gyro_x, gyro_y, gyro_z read {1.0 / abs(slope):.3g} times the rate at which gravity turns "

@@ -72,7 +72,7 @@ def match_reference(
 
     Raises `InputError` where the reference does not fit the recording, `NotPossibleError` where nothing is left.
     """
-    notes: list[str] = []
+    notes = []
     usable = [entry for entry in entries if _inside(recording, entry, notes)]
     where, gyroscope = recording.name, recording.gyroscope
     if not usable:
@@ -272,7 +272,7 @@ def _entries_of_attitude(recording: Recording, attitude: Signal) -> list[Schedul
     before, after = _neighbours(len(attitude), _WINDOW * attitude.rate / 2)
     angle = (rotation[before].inv() * rotation[after]).magnitude()
     spans = _rests(attitude.time, angle / (attitude.time[after] - attitude.time[before]), recording.name)
-    entries: list[ScheduleEntry] = []
+    entries = []
     for index, (start, stop) in enumerate(spans):
         up = rotation[(attitude.time >= start) & (attitude.time <= stop)].inv().apply([0.0, 0.0, 1.0]).mean(axis=0)
         entries.append(ScheduleEntry(start, stop, "pose", up / np.linalg.norm(up)))
@@ -310,7 +310,7 @@ def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray)
             f"{recording.name}: from {start:.6g} to {stop:.6g} s no axis of the body is vertical ({off[first]:.0f}° "
             "off): table columns describe only turns about a vertical body axis; write a schedule for other poses."
         )
-    entries: list[ScheduleEntry] = []
+    entries = []
     for index, ((start, stop), up) in enumerate(zip(spans, ups, strict=True)):
         heading = np.interp((start + stop) / 2, time, angle) if recording.table_angle is not None else None
         entries.append(ScheduleEntry(start, stop, "pose", up, heading=heading))

@@ -39,10 +39,10 @@ from typing import Any
 from jaximu.ground.document import Json, file_digest, read_toml
 from jaximu.ground.errors import FilePath, InputError, only
 
-_REFERENCE = ("name", "certificate", "expires", "file", "value", "uncertainty")
-_CERTIFICATE = ("number", "laboratory", "address", "customer", "authorised_by")
+_REFERENCE = "name certificate expires file value uncertainty".split()
+_CERTIFICATE = "number laboratory address customer authorised_by".split()
 NEEDED = (
-    *("serial", "model", "operator", "date", "environment", "reference"),
+    *"serial model operator date environment reference".split(),
     *(f"certificate.{key}" for key in _CERTIFICATE),
 )
 """What ISO/IEC 17025, 7.8.2 and 7.8.4, asks of a certificate and the recording does not say."""
@@ -99,7 +99,7 @@ def _date(value: Any, where: str) -> str:
 
 
 _SAID: dict[str, Callable[[Any, str], str]] = {
-    **{key: _text for key in ("serial", "model", "lot", "operator", "station", "fixture")},
+    **{key: _text for key in "serial model lot operator station fixture".split()},
     **{"date": _date, "received": _date},
 }
 """What a file's first part and options say, and what makes it out."""
@@ -112,8 +112,7 @@ def _reference(entry: Any, where: str, name: str) -> dict[str, str]:
     for key in ("name", "certificate"):
         if key not in entry:
             raise InputError(f"{where}: the {key} is missing.")
-    made_out = {"expires": _date}
-    reference = {key: made_out.get(key, _text)(value, f"{where}.{key}") for key, value in entry.items()}
+    reference = {key: (_date if key == "expires" else _text)(value, f"{where}.{key}") for key, value in entry.items()}
     if "file" in entry:
         path = Path(name).parent / reference["file"]
         reference |= {"file": str(path), "sha256": file_digest(path)}

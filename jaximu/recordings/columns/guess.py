@@ -409,7 +409,7 @@ class _Guess:
         """Triads that nobody has named: by stems, or, in a table without names, three columns side by side."""
         unknown = self.unknown = [triad for triad in triads if triad.sensor is None]
         taken = {at for triad in triads for at in triad.places} | {self.time}
-        free: list[int] = []
+        free = []
         for at, field, values in self._looked_at():
             if at in taken or values is None or field.sensor or field.why_not or set(field.stem) & _COUNTERS:
                 continue
@@ -766,7 +766,7 @@ class _Guess:
         return None
 
     def _gyro_counts(self, slope: float | None) -> None:
-        fitting: list[str] = []
+        fitting = []
         if slope:
             per_degree = math.pi / 180 / slope
             off = {scale: abs(math.log(per_degree / scale)) for scale in _PER_DEGREE}
@@ -909,7 +909,7 @@ class _Guess:
 
 def column_text(columns: Sequence[Column]) -> str:
     """The columns as `--columns` takes them, as short as can be."""
-    entries: list[str] = []
+    entries = []
     names, at = [column.name for column in columns], 0
     triads: dict[tuple, str] = {group.columns: key for key, group in GROUPS.items() if len(group.columns) == 3}
     while at < len(columns):
@@ -925,7 +925,7 @@ def column_text(columns: Sequence[Column]) -> str:
 
 def _plausible(peak: float, bias: float, noise: float | None) -> list[str]:
     """The units in which a sensor may read so much: 2300 °/s at most, and at rest 25 °/s of bias, 3 °/s of scatter."""
-    units: list[str] = []
+    units = []
     for unit in ("rad/s", "deg/s", "mdeg/s"):
         degree = math.degrees(_ANGLES[unit])
         at_rest = noise is None or (bias * degree < 25 and 1e-4 < noise * degree < (1.0 if unit == "deg/s" else 3.0))

@@ -70,7 +70,7 @@ def parse_columns(text: str | Sequence[str]) -> tuple[Column, ...]:
     "_", "-" or "skip" ignores a column, "_*5" five of them; a bare triad ("accel [g]", "gyro [dps]", "mag [uT]",
     "attitude") stands for its three (four) columns. Raises InputError for a name that is not known.
     """
-    columns: list[Column] = []
+    columns = []
     for entry in text.split(",") if isinstance(text, str) else text:
         name, stated = parse_column(entry)
         if match := _SKIPPED.fullmatch(name.lower()):

@@ -13,8 +13,8 @@ from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.recording import Source
 
 _WIDEST = 16  # an array with more columns than this is no sensor
-_RATES = {"samplingrate", "samplerate", "rate", "fs", "frequency", "freq", "samplingfrequency", "odr"}
-_INTERVALS = dict.fromkeys(("ts", "dt", "sampletime", "sampleinterval", "samplinginterval"), 1.0) | {"intervalms": 1e3}
+_RATES = set("samplingrate samplerate rate fs frequency freq samplingfrequency odr".split())
+_INTERVALS = dict.fromkeys("ts dt sampletime sampleinterval samplinginterval".split(), 1.0) | {"intervalms": 1e3}
 _AXES = {3: ("x", "y", "z"), 4: ("w", "x", "y", "z")}
 
 
@@ -43,8 +43,8 @@ def table_of(variables: Mapping[str, Any], source: Source) -> LogTable:
     for _, array in arrays:  # parameters are many and short, the samples are where the numbers are
         sizes[max(array.shape)] += array.size
     rows = sizes.most_common(1)[0][0]
-    names: list[str] = []
-    columns: list[np.ndarray] = []
+    names = []
+    columns = []
     for name, array in arrays:
         array = array.reshape(-1, 1) if array.ndim == 1 or 1 in array.shape else array
         array = array.T if array.shape[0] != rows and array.shape[-1] == rows else array

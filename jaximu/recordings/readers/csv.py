@@ -99,8 +99,8 @@ def read(path: Path, source: Source) -> LogTable:
 
 def _vectors_apart(names: Sequence[str], columns: Sequence[np.ndarray]) -> tuple[list[str], list[np.ndarray]]:
     """The columns, with x, y and z of their own where each cell holds three numbers, in brackets or with bars."""
-    titles: list[str] = []
-    parts: list[np.ndarray] = []
+    titles = []
+    parts = []
     for name, column in zip(names, columns, strict=True):
         vector = column.dtype == object and _VECTOR.fullmatch(str(column[0]))
         matches = [_VECTOR.fullmatch(str(cell)) for cell in column] if vector else [None]
@@ -137,7 +137,7 @@ def _read_straight(path: Path, layout: _Layout) -> tuple[list[np.ndarray], pa.Sc
     None where lines are empty, are comments, or have cells of another type than others.
     """
     parts: list[list[np.ndarray]] = []
-    schemas: list[pa.Schema] = []
+    schemas = []
     with suppress(pa.ArrowInvalid), path.open("rb") as file:
         above = [file.readline().strip() for _ in range(layout.first)]
         while piece := file.read(_PIECE):

@@ -115,7 +115,7 @@ def _line_names(line: str, heading: str) -> list[str]:
     heading: of the lines above that hold no number.
     """
     parts = re.split(r"[#@]", line)
-    names: list[str] = []
+    names = []
     group, axis = "", 0
     for number, text in enumerate(parts[:-1]):
         words = _label(text)
@@ -160,7 +160,7 @@ def _with_units(names: list[str], parts: list[str]) -> list[str]:
 
 def _names(sample: tuple[str, ...]) -> list[str]:
     """The names of a sample's numbers, under the headings of lines that hold none, as far as these are set in."""
-    names: list[str] = []
+    names = []
     headings: list[tuple[int, str]] = []
     for line in sample:
         indent = len(line) - len(line.lstrip())
@@ -202,7 +202,7 @@ def read(data: bytes, source: Source) -> LogTable:
     if sample is None or len(rows) < 2:
         raise InputError(f"{source.path}: holds no whole samples of text with labels.")
     first, cells = zip(*rows, strict=True)
-    columns: list[np.ndarray] = []
+    columns = []
     names = _names(sample)
     if _PROTOCOL.fullmatch(sample[0]):
         names[-1], note = "time [ns]", "InfluxDB's line protocol: fields by name, the time in ns at the end."

@@ -353,10 +353,6 @@ class _Format:
     function: str = "read"
     needs: str | None = None
 
-    @property
-    def by_path(self) -> bool:
-        return self is _TEXT or self.needs is not None
-
 
 _TEXT = _Format("text", "csv")
 _TAGGED = _Format("tagged text", "tagged")
@@ -487,7 +483,7 @@ def _tables_of_file(file: Path, name: str, options: ReadOptions) -> tuple[LogTab
     """The tables of one file, which messages call `name`."""
     with readable(name):
         kind = _recognise(file, name)
-        data = file if kind.by_path else file.read_bytes()
+        data = file if kind is _TEXT or kind.needs else file.read_bytes()
     more = (options,) if kind.needs or kind is _TAGGED else ()
     try:
         with ThreadPoolExecutor(1) as beside:
@@ -677,8 +673,9 @@ def _ordered(table: LogTable, clock: int, unit: Unit) -> LogTable:
         )
         table = table.noted(Defect("data.order", text))
     if shared:
-        text = f"{shared} messages repeat the stamp of another and were left out."
-        table = table.noted(Defect("data.duplicate", text))
+        table = table.noted(
+            Defect("data.duplicate", f"{shared} messages repeat the stamp of another and were left out.")
+        )
     return table
 
 
@@ -696,7 +693,7 @@ def _rising(table: LogTable, clock: int, unit: Unit) -> LogTable:
     def listed(rows: np.ndarray) -> str:
         return ", ".join(str(table.row(row)) for row in rows[:5])
 
-    notes: list[str] = []
+    notes = []
     usual = np.median(np.abs(steps[steps != 0])) if (steps != 0).any() else 0.0
     count = len(stamps)
     order = np.arange(count)
@@ -751,15 +748,14 @@ def _rising(table: LogTable, clock: int, unit: Unit) -> LogTable:
     if len(back) and (shared.any() or close > before):
         return table  # sorting does not help: stamps are wrong, and which, the refusal says
     table, stamps = table.take(kept).noted(*notes), stamps[kept]
-    if not len(back) and shared.sum() >= _FEW_SHARED and _FEW_SHARES < shared.mean() <= 0.25:
-        even = _even_clock(stamps)
-        if even is not None:
-            rate = (len(even) - 1) / ((even[-1] - even[0]) * unit.factor)
-            text = (
-                f"{shared.sum()} stamps repeat the one before, and the rows are in order: a steady clock of "
-                f"{rate:.5g} Hz fitted to the stamps replaces them."
-            )
-            return table.with_column(clock, even).noted(Defect("data.jitter", text))
+    often = not len(back) and shared.sum() >= _FEW_SHARED and _FEW_SHARES < shared.mean() <= 0.25
+    if often and (even := _even_clock(stamps)) is not None:
+        rate = (len(even) - 1) / ((even[-1] - even[0]) * unit.factor)
+        text = (
+            f"{shared.sum()} stamps repeat the one before, and the rows are in order: a steady clock of "
+            f"{rate:.5g} Hz fitted to the stamps replaces them."
+        )
+        return table.with_column(clock, even).noted(Defect("data.jitter", text))
     if shared.mean() > 0.25:  # bursts with one time of arrival for all their rows
         number = np.arange(len(kept))
         position = number - np.maximum.accumulate(np.where(np.concatenate([[True], ~shared]), number, 0))

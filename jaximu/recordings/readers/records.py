@@ -24,7 +24,7 @@ from jaximu.recordings.readers.arrays import table_of
 from jaximu.recordings.readers.clock import seconds_of
 from jaximu.recordings.recording import Source
 
-_TAGS = ("sensor", "sensorname", "sensor_name", "type", "name", "topic")
+_TAGS = "sensor sensorname sensor_name type name topic".split()
 _ANDROID = {"accel": "m/s^2", "gyro": "rad/s", "mag": "uT"}
 
 
@@ -54,7 +54,8 @@ def read(data: bytes, source: Source) -> LogTable | tuple[LogTable, ...]:
 def _records(document: Any) -> list[Json] | None:
     """The longest list of records, or of rows under a list of names, in a document."""
     if isinstance(document, list):
-        return [record for record in document if isinstance(record, dict)] if any(map(_is_record, document)) else None
+        records = [record for record in document if isinstance(record, dict)]
+        return records if any(len(record) > 1 for record in records) else None
     if not isinstance(document, Mapping):
         return None
     rows, sensors = document.get("values"), document.get("sensors")
@@ -64,10 +65,6 @@ def _records(document: Any) -> list[Json] | None:
         return [dict(zip(names, row, strict=False)) for row in rows]
     lists = [records for value in document.values() if (records := _records(value))]
     return max(lists, key=len) if lists else None
-
-
-def _is_record(value: Any) -> bool:
-    return isinstance(value, dict) and len(value) > 1
 
 
 def _leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

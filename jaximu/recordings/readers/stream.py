@@ -75,7 +75,7 @@ class Lines:
         """
         if self._file is not None:
             return list(islice(self._sound(self._file), count))
-        lines: list[bytes] = []
+        lines = []
         until = time.monotonic() + self._patience
         while len(lines) < count or not self._queue.empty():
             try:

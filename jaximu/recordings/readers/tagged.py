@@ -58,7 +58,7 @@ def read(data: bytes, source: Source, options: ReadOptions) -> tuple[LogTable, .
     """The tables in a tagged text, one a sensor. Raises InputError where no row of a sensor is there."""
     log = dialect(data)
     assert log is not None
-    tables: list[LogTable] = []
+    tables = []
     shift = 0 if b"Stream Type,F#" not in data[:HEAD] else -1  # older versions write no index
     stamp = options.stamp if options.stamp in log.notes else "header"
     for tag, (name, first) in log.tags.items():
