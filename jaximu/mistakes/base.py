@@ -95,8 +95,7 @@ class Sensor:
         values = self.values
         misfit = np.zeros_like(values)
         misfit[2:-2] = values[2:-2] - (4 * (values[1:-3] + values[3:-1]) - values[:-4] - values[4:]) / 6
-        broken = np.flatnonzero(~self.even)
-        misfit[np.clip(broken[:, None] + np.arange(-1, 3), 0, len(values) - 1)] = 0.0
+        misfit[np.clip(np.flatnonzero(~self.even)[:, None] + np.arange(-1, 3), 0, len(values) - 1)] = 0.0
         return misfit
 
     @cached_property
@@ -107,8 +106,7 @@ class Sensor:
     @cached_property
     def noise(self) -> FloatArray:
         """(3,) standard deviation of the noise from sample to sample where it is lowest."""
-        lowest = np.quantile(self.local[::16], 0.2, axis=0)
-        return np.maximum(lowest / _CURVATURE_NOISE, self.step / np.sqrt(12))
+        return np.maximum(np.quantile(self.local[::16], 0.2, axis=0) / _CURVATURE_NOISE, self.step / np.sqrt(12))
 
     @cached_property
     def coarse(self) -> tuple[float | None, ...]:
@@ -224,6 +222,11 @@ class Samples:
         force, rate = self.accelerometer, self.gyroscope
         return None if force is None or rate is None else (force, rate)
 
+    @property
+    def outputs(self) -> tuple[FloatArray, ...]:
+        """The stamps and values of the accelerometer, then of the gyroscope, as far as they are there."""
+        return tuple(part for sensor in self.sensors.values() for part in (sensor.time, sensor.values))
+
     @cached_property
     def shared(self) -> bool:
         """Whether both sensors have one row for each stamp."""
@@ -239,18 +242,12 @@ class Samples:
     @cached_property
     def turning(self) -> BlockMeans | None:
         """How gravity turns beside the gyroscope's angle; None without a gyroscope or in a short recording."""
-        if self.both is None:
-            return None
-        force, rate = self.both
-        return gravity_turning(force.time, force.values, rate.time, rate.values)
+        return gravity_turning(*self.outputs) if self.both else None
 
     @cached_property
     def clocks(self) -> Clocks | None:
         """By how much the gyroscope's stamps are late, None where nothing turns or there is no gyroscope."""
-        if self.both is None:
-            return None
-        force, rate = self.both
-        return clocks(force.time, force.values, rate.time, rate.values)
+        return clocks(*self.outputs) if self.both else None
 
     @cached_property
     def rests(self) -> FloatArray:
@@ -288,8 +285,7 @@ class Samples:
         sensor, rests = self.accelerometer, self.rests
         if sensor is None or not len(rests):
             return 0
-        edges = np.searchsorted(sensor.time, rests)
-        means = of_each(np.median, sensor.values, edges)
+        means = of_each(np.median, sensor.values, np.searchsorted(sensor.time, rests))
         size = lengths_of(means)
         if np.ptp(size) > 0.5 * np.median(size):
             return None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from jaximu.ground.array_types import BoolArray, FloatArray
@@ -27,19 +29,17 @@ _FEWEST = 10
 """Excursions near the limit from which on it is a soft one."""
 
 
-def find(samples: Samples) -> list[Finding]:
+def find(samples: Samples) -> Iterator[Finding]:
     """Return the axes whose values stop at a limit, or crowd below one."""
-    findings = []
     for name, sensor in samples.sensors.items():
-        findings += _clipped(sensor) or (_saturated(samples, sensor) if name == "gyroscope" else [])
-    return findings
+        yield from _clipped(sensor) or (_saturated(samples, sensor) if name == "gyroscope" else [])
 
 
 def _clipped(sensor: Sensor) -> list[Finding]:
     """Return the ends of the range at which a sensor's axes stop."""
     extremes = sensor.extremes
-    axes: list[str] = []
-    ends: list[Rows] = []
+    axes = []
+    ends = []
     limits, rows, all_out = [], np.zeros(len(sensor), bool), at_limits(sensor)
     for axis, extreme in zip(np.repeat(range(3), 2), extremes.T.ravel(), strict=True):
         values = sensor.values[:, axis]
@@ -109,27 +109,27 @@ def stops(values: FloatArray, extreme: float) -> Rows:
     return runs if many and (alone or brief) and not whole else runs[:0]
 
 
-def _saturated(samples: Samples, sensor: Sensor) -> list[Finding]:
+def _saturated(samples: Samples, sensor: Sensor) -> Iterator[Finding]:
     """Excursions of all axes that end just below one limit, and are the flatter the nearer they come to it."""
     quiet = samples.quiet_at(sensor)
     bias = np.median(sensor.values[quiet], axis=0) if quiet.any() else np.zeros(3)
     size = np.abs(sensor.values - bias)
-    limit = float(np.sort(size.max(axis=1))[-max(3, len(size) // 5000)])
+    limit = np.sort(size.max(axis=1))[-max(3, len(size) // 5000)]
     if limit < 0.2 or limit < 100 * np.max(sensor.noise):
-        return []
+        return
     tops, flat, places = [], [], []
     for axis in range(3):
         for a, b in runs_of(size[:, axis] > 0.4 * limit):
             part = size[a:b, axis]
             if len(part) < 8:
                 continue
-            top = float(np.sort(part)[-max(1, len(part) // 20)])  # without the noise of single samples
+            top = np.sort(part)[-max(1, len(part) // 20)]  # without the noise of single samples
             if top > 0.55 * limit:
                 tops.append(top / limit)
                 flat.append(np.sum(part > 0.95 * top) / max(1, np.sum(part > 0.5 * top)))
                 places.append(a)
     if len(tops) < 3:
-        return []
+        return
     tops, flat = np.array(tops), np.array(flat)
     upper, middle, lower = tops > 0.85, (tops > 0.6) & (tops <= 0.85), tops < 0.75
     # hard: several excursions end flat at the limit itself, and hardly any below it
@@ -146,7 +146,7 @@ def _saturated(samples: Samples, sensor: Sensor) -> list[Finding]:
         and typical > np.median(flat[lower]) - 0.005
     )
     if not hard and not soft:
-        return []
+        return
     # behind a hard limit the tops lie at it; a soft one spreads them
     hard = hard and (not soft or np.mean(tops[upper] > 0.965) > 0.75)
     shown, taken = f"{np.degrees(limit):.4g} °/s", crowd if hard else upper
@@ -161,4 +161,4 @@ def _saturated(samples: Samples, sensor: Sensor) -> list[Finding]:
     )
     rows, text = sensor.rows(np.sort(np.array(places)[taken])), f"gyroscope: {flattened if hard else compressed}"
     clipped = {"gyroscope": np.flatnonzero((size > 0.9 * limit).any(axis=1))} if hard else {}
-    return [Finding("data.saturation", rows, text, spoils=not hard, without=clipped)]
+    yield Finding("data.saturation", rows, text, spoils=not hard, without=clipped)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from jaximu.mistakes.base import Samples, with_signal
@@ -18,16 +20,16 @@ _HARMFUL = 0.3
 """Seconds from which on parts of turns pass for poses."""
 
 
-def find(samples: Samples) -> list[Finding]:
+def find(samples: Samples) -> Iterator[Finding]:
     """Return whether the gyroscope's stamps are late against the accelerometer's, or its clock runs otherwise."""
     clocks, gyroscope = samples.clocks, samples.gyroscope
     if clocks is None or gyroscope is None or clocks.explained < EXPLAINED:
-        return []
+        return
     ends = clocks.late(gyroscope.time[[0, -1]])
     drifts = abs(clocks.drift) > _SURE * clocks.drift_sigma
     delay = float(np.max(np.abs(ends))) if drifts else abs(clocks.offset)
     if delay < _LEAST or (not drifts and delay < _SURE * clocks.sigma):
-        return []
+        return
 
     right = clocks if drifts else clocks._replace(drift=0.0, drift_sigma=0.0)  # sensors of one clock
 
@@ -43,10 +45,11 @@ def find(samples: Samples) -> list[Finding]:
             "samples here and there. --repair puts them on the accelerometer's clock."
         )
         rivals = ("data.lost_samples",)
-        return [Finding("data.clocks", (), text, "--repair", rivals, spoils=delay > _HARMFUL, apply=apply)]
+        yield Finding("data.clocks", (), text, "--repair", rivals, spoils=delay > _HARMFUL, apply=apply)
+        return
     text = (
         f"gyroscope: its stamps are {1e3 * abs(clocks.offset):.3g} ± {1.96e3 * clocks.sigma:.2g} ms "
         f"{'late' if clocks.offset > 0 else 'early'} against the accelerometer's, or a filter delays "
         "it by as much (gyro.lag). --repair shifts them."
     )
-    return [Finding("setup.time_offset", (), text, "--repair", ("gyro.lag",), spoils=delay > _HARMFUL, apply=apply)]
+    yield Finding("setup.time_offset", (), text, "--repair", ("gyro.lag",), spoils=delay > _HARMFUL, apply=apply)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from jaximu.ground.quantities import counted
@@ -20,27 +22,25 @@ _DISTINCT = 5, 0.5
 sensor that stands still repeats itself."""
 
 
-def find(samples: Samples) -> list[Finding]:
+def find(samples: Samples) -> Iterator[Finding]:
     """Return the rows that repeat a block of earlier ones."""
     sensors = list(samples.sensors.values())
     if not sensors or (len(sensors) > 1 and not samples.shared):
-        return []
+        return
     values = np.hstack([sensor.signal.values for sensor in sensors])
     rows = _repeated(values)
     if not len(rows):
-        return []
+        return
     first = sensors[0]
     blocks = runs_of(np.isin(np.arange(len(values)), rows))
-    return [
-        Finding(
-            "data.duplicate",
-            first.rows(blocks[:, 0]),
-            f"{counted(len(rows), 'row')} in {counted(len(blocks), 'block')} repeat earlier rows value by value, first "
-            f"from {first.at(rows[0])}: they were pasted twice, or the logger wrote a buffer twice. "
-            "The second copy is left out.",
-            without=dict.fromkeys(samples.sensors, rows),
-        )
-    ]
+    yield Finding(
+        "data.duplicate",
+        first.rows(blocks[:, 0]),
+        f"{counted(len(rows), 'row')} in {counted(len(blocks), 'block')} repeat earlier rows value by value, first "
+        f"from {first.at(rows[0])}: they were pasted twice, or the logger wrote a buffer twice. "
+        "The second copy is left out.",
+        without=dict.fromkeys(samples.sensors, rows),
+    )
 
 
 def _repeated(values: np.ndarray) -> Rows:
@@ -48,10 +48,9 @@ def _repeated(values: np.ndarray) -> Rows:
     count = len(values)
     mixed = np.random.default_rng(0).integers(1, 2**62, values.shape[1], dtype=np.uint64) | np.uint64(1)
     # + 0.0 makes one zero of both; a sum of the bits times odd numbers separates rows
-    bits = np.ascontiguousarray(values + 0.0).view(np.uint64)
-    code = (bits * mixed).sum(axis=1, dtype=np.uint64)
+    code = (np.ascontiguousarray(values + 0.0).view(np.uint64) * mixed).sum(axis=1, dtype=np.uint64)
     code ^= code >> np.uint64(29)
-    near = max(float(np.mean(code[lag:] == code[:-lag])) for lag in (1, 2, 3, 5, 8))
+    near = max(np.mean(code[lag:] == code[:-lag]) for lag in (1, 2, 3, 5, 8))
     length = int(np.clip(np.ceil(np.log(count**2 / _CHANCE) / -np.log(max(near, 1e-9))), 8, 2000)) if near < 1 else 0
     if length == 0 or 2 * length > count:
         return NO_ROWS

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from jaximu.ground.array_types import BoolArray
@@ -42,11 +44,11 @@ def zeroed_at_rest(samples: Samples) -> float | None:
     return share
 
 
-def find(samples: Samples) -> list[Finding]:
+def find(samples: Samples) -> Iterator[Finding]:
     """Return a gyroscope that is set to zero, held, or drawn to zero at rest."""
     sensor = samples.gyroscope
     if sensor is None:
-        return []
+        return
     zero = sensor.signal.values == 0.0
     if sensor.dead_band is not None:
         share, least = sensor.dead_band
@@ -55,9 +57,10 @@ def find(samples: Samples) -> list[Finding]:
             f"smaller than {size(least, 'rad/s', 2)}: its driver zeroes it at rest (a dead band), so neither its "
             "bias nor its noise is known. Switch the dead band off and record again."
         )
-        return [_finding(sensor, zero.any(axis=1), text, "gyroscope" if samples.rested else "")]
+        yield _finding(sensor, zero.any(axis=1), text, "gyroscope" if samples.rested else "")
+        return
     if samples.accelerometer is None:
-        return []
+        return
     share = zeroed_at_rest(samples)
     if share is not None:
         text = (
@@ -65,7 +68,8 @@ def find(samples: Samples) -> list[Finding]:
             "its driver zeroes it at rest, so its bias in turns is unknown. Switch the automatic zero off and record "
             "again."
         )
-        return [_finding(sensor, zero.all(axis=1), text)]
+        yield _finding(sensor, zero.all(axis=1), text)
+        return
     rest = samples.quiet_at(sensor)
     held = _held(samples, sensor, rest)
     if held is not None:
@@ -73,8 +77,9 @@ def find(samples: Samples) -> list[Finding]:
             f"gyroscope: its noise at rest is {100 * held:.2g} % of that in motion: its driver holds it at rest, so "
             "its bias in turns is unknown. Switch the automatic zero off and record again."
         )
-        return [_finding(sensor, rest, text)]
-    return _high_passed(samples, sensor)
+        yield _finding(sensor, rest, text)
+        return
+    yield from _high_passed(samples, sensor)
 
 
 def _finding(sensor: Sensor, concerned: BoolArray, text: str, refuses: str = "") -> Finding:
@@ -94,32 +99,32 @@ def _held(samples: Samples, sensor: Sensor, rest: BoolArray) -> float | None:
     return ratio if ratio < 1e-3 and np.all(moving > 1e-5) and np.all(at_rest < 1e-7) else None
 
 
-def _high_passed(samples: Samples, sensor: Sensor) -> list[Finding]:
+def _high_passed(samples: Samples, sensor: Sensor) -> Iterator[Finding]:
     """A running mean that is taken off: at rest the output is then −(angle turned so far)/τ, whatever the motion was.
 
     A filter y = ω − m with m' = y/τ has m = m₀ + ∫y dt/τ, so that adding ∫y dt/τ undoes it.
     """
     rests = samples.rests
     if len(rests) < _FEWEST:
-        return []
+        return
     angle = np.cumsum(sensor.values * sensor.period, axis=0)
     middle = rests.mean(axis=1)
     spans = np.concatenate([np.stack([rests[:, 0] + 0.1, middle], 1), np.stack([middle, rests[:, 1] - 0.1], 1)])
     edges = np.clip(np.searchsorted(sensor.time, spans), 0, len(sensor) - 1)
     edges = edges[edges[:, 1] - edges[:, 0] > 5]
     if len(edges) < 2 * _FEWEST:
-        return []
+        return
     rate, turned = (of_each(np.mean, values, edges) for values in (sensor.values, angle))
     rate, turned = rate - rate.mean(axis=0), turned - turned.mean(axis=0)
     power = np.sum(turned**2)
     if not power > 0:
-        return []
+        return
     slope = np.sum(rate * turned) / power
     unexplained = np.sum((rate - slope * turned) ** 2)
     slopes = np.sum(rate * turned, axis=0) / np.maximum(np.sum(turned**2, axis=0), 1e-300)
     # one time constant for all axes, and nearly all of what the means do at rest
     if not -10.0 < slope < -1e-3 or unexplained > 0.1 * np.sum(rate**2) or np.any(np.abs(slopes / slope - 1) > 0.35):
-        return []
+        return
 
     def apply(recording: Recording) -> Recording:
         signal = recording.signals["gyroscope"]
@@ -127,15 +132,13 @@ def _high_passed(samples: Samples, sensor: Sensor) -> list[Finding]:
         mean = np.cumsum(signal.si() * np.median(np.diff(signal.time)), axis=0)
         return with_signal(recording, "gyroscope", values=signal.values - slope * mean * signal.nominal_scale)
 
-    return [
-        Finding(
-            "data.auto_zero",
-            sensor.rows(edges[:1, 0]),
-            f"gyroscope: at rest it reads minus the angle turned so far over {-1 / slope:.3g} s, on all axes: a "
-            "high-pass filter takes its running mean off. --repair adds the mean back; better switch the automatic "
-            "zero off and record again.",
-            repair="--repair",
-            spoils=True,
-            apply=apply,
-        )
-    ]
+    yield Finding(
+        "data.auto_zero",
+        sensor.rows(edges[:1, 0]),
+        f"gyroscope: at rest it reads minus the angle turned so far over {-1 / slope:.3g} s, on all axes: a "
+        "high-pass filter takes its running mean off. --repair adds the mean back; better switch the automatic "
+        "zero off and record again.",
+        repair="--repair",
+        spoils=True,
+        apply=apply,
+    )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from jaximu.ground.distributions import robust_sigma
@@ -21,13 +23,13 @@ _MOST = 0.05
 """Share of a recording beyond which the unit was not at rest."""
 
 
-def find(samples: Samples) -> list[Finding]:
+def find(samples: Samples) -> Iterator[Finding]:
     """Return the stretches in which a unit that rests else was knocked: no part of its noise."""
     if not samples.rested:
-        return []
+        return
     spans = np.concatenate([_knocks(sensor) for sensor in samples.sensors.values()])
     if not len(spans):
-        return []
+        return
     without = {}
     for name, sensor in samples.sensors.items():
         edges = np.searchsorted(sensor.time, spans + [-_AROUND, _AROUND])
@@ -36,19 +38,17 @@ def find(samples: Samples) -> list[Finding]:
         np.add.at(marked, edges[:, 1], -1)
         without[name] = np.flatnonzero(np.cumsum(marked)[:-1] > 0)
     if any(len(rows) > _MOST * len(samples.sensors[name]) for name, rows in without.items()):
-        return []
+        return
     first = samples.first
     rows = without[first.name]
     starts = rows[np.concatenate([[True], np.diff(rows) > 1])]
-    return [
-        Finding(
-            "data.knock",
-            first.rows(starts),
-            f"The unit rests, but was knocked{'' if len(starts) == 1 else f' {len(starts)} times'}, first about "
-            f"{spans[:, 0].min():.1f} s in: {len(rows) / first.rate:.3g} s are left out.",
-            without=without,
-        )
-    ]
+    yield Finding(
+        "data.knock",
+        first.rows(starts),
+        f"The unit rests, but was knocked{'' if len(starts) == 1 else f' {len(starts)} times'}, first about "
+        f"{spans[:, 0].min():.1f} s in: {len(rows) / first.rate:.3g} s are left out.",
+        without=without,
+    )
 
 
 def _knocks(sensor: Sensor) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import combinations
 
 import numpy as np
@@ -32,9 +33,8 @@ def find(samples: Samples) -> list[Finding]:
     return copies or [*_dead_force(samples), *_dead_rate(samples)]
 
 
-def _copied(sensor: Sensor) -> list[Finding]:
+def _copied(sensor: Sensor) -> Iterator[Finding]:
     """Two axes with the same noise, or exactly proportional ones."""
-    findings = []
     # in motion about one axis the others may be proportional, too: their noise is not
     noise = sensor.curvature[sensor.quiet]
     products, of_noise = sensor.difference.T @ sensor.difference, noise.T @ noise
@@ -48,45 +48,39 @@ def _copied(sensor: Sensor) -> list[Finding]:
         wide = np.ptp(sensor.values[:, second]) >= 20 * sensor.noise[second]
         if wide and whole > 0.98 and same > 0.9 and len(noise) > 50:
             factor = products[first, second] / products[first, first]
-            findings.append(
-                Finding(
-                    "data.copied_axis",
-                    (),
-                    f"{sensor.name}: {'xyz'[second]} is {factor:.3g} times {'xyz'[first]}, noise included: one of the "
-                    "two was not recorded. Check the columns, and record again.",
-                    spoils=True,
-                    refuses=sensor.name,
-                )
+            yield Finding(
+                "data.copied_axis",
+                (),
+                f"{sensor.name}: {'xyz'[second]} is {factor:.3g} times {'xyz'[first]}, noise included: one of the "
+                "two was not recorded. Check the columns, and record again.",
+                spoils=True,
+                refuses=sensor.name,
             )
-    return findings
 
 
-def _dead_force(samples: Samples) -> list[Finding]:
+def _dead_force(samples: Samples) -> Iterator[Finding]:
     """An axis that stays put while the other two turn through gravity, so that the norm at rest does not stay g."""
     sensor = samples.accelerometer
     if sensor is None:
-        return []
+        return
     _, mean, variance = sensor.blocks
-    calm = variance.sum(axis=1) < 4 * np.quantile(variance.sum(axis=1), 0.3)
-    mean = mean[calm]
+    mean = mean[variance.sum(axis=1) < 4 * np.quantile(variance.sum(axis=1), 0.3)]
     if len(mean) < 12:
-        return []
+        return
     span = np.ptp(np.quantile(mean, [0.02, 0.98], axis=0), axis=0)
     axis = int(np.argmin(span))
     turns = span[axis] <= 0.05 * STANDARD_GRAVITY and np.min(np.delete(span, axis)) >= 0.8 * STANDARD_GRAVITY
     if not turns or _turned_about(mean, axis):
-        return []
-    return [
-        Finding(
-            "data.dead_axis",
-            (),
-            f"accelerometer {'xyz'[axis]}: it stays within {span[axis]:.2g} m/s² while the other axes turn through "
-            "gravity, and the norm at rest does not stay that of gravity: the axis is dead. Check the sensor and the "
-            "columns.",
-            spoils=True,
-            refuses="accelerometer",
-        )
-    ]
+        return
+    yield Finding(
+        "data.dead_axis",
+        (),
+        f"accelerometer {'xyz'[axis]}: it stays within {span[axis]:.2g} m/s² while the other axes turn through "
+        "gravity, and the norm at rest does not stay that of gravity: the axis is dead. Check the sensor and the "
+        "columns.",
+        spoils=True,
+        refuses="accelerometer",
+    )
 
 
 def _turned_about(mean: FloatArray, axis: int) -> bool:
@@ -101,16 +95,16 @@ def _turned_about(mean: FloatArray, axis: int) -> bool:
     return bool(spread < _ROUND / 3 and abs(radius - 1) < _ROUND and np.linalg.norm(centre) < _OFF)
 
 
-def _dead_rate(samples: Samples) -> list[Finding]:
+def _dead_rate(samples: Samples) -> Iterator[Finding]:
     """An axis of the gyroscope without motion, about which gravity turns."""
     sensor, blocks = samples.gyroscope, samples.turning
     if sensor is None or blocks is None:
-        return []
+        return
     moved = np.sqrt(np.mean((sensor.values - np.median(sensor.values, axis=0)) ** 2, axis=0))
     axis = np.argmin(moved)
     others = np.min(np.delete(moved, axis))
     if others < 0.05 or moved[axis] > 0.02 * others or abs(np.median(sensor.values[:, axis])) > _NO_BIAS:
-        return []
+        return
     unexplained = blocks.change + np.cross(blocks.turned(), blocks.force)
     about = -np.cross(np.eye(3)[axis], blocks.force)  # what a rotation about the dead axis would do
     power = np.sum(about**2, axis=1)
@@ -118,14 +112,12 @@ def _dead_rate(samples: Samples) -> list[Finding]:
     along = np.sum(dot_rows(unexplained, about)[good] ** 2 / power[good])
     needed = _OF_REST if moved[axis] > _LEAK * others else _OF_REST / 3
     if along < 0.1 * np.sum(blocks.change[good] ** 2) or along < needed * np.sum(unexplained[good] ** 2):
-        return []
-    return [
-        Finding(
-            "data.dead_axis",
-            (),
-            f"gyroscope {'xyz'[axis]}: it hardly moves, but gravity turns about this axis: the axis is dead. Check the "
-            "sensor and the columns.",
-            spoils=True,
-            refuses="gyroscope",
-        )
-    ]
+        return
+    yield Finding(
+        "data.dead_axis",
+        (),
+        f"gyroscope {'xyz'[axis]}: it hardly moves, but gravity turns about this axis: the axis is dead. Check the "
+        "sensor and the columns.",
+        spoils=True,
+        refuses="gyroscope",
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -122,7 +123,7 @@ def _quickly(samples: Samples, wanted: Rows, half: int) -> tuple[FloatArray, Flo
 
 def _pairs(samples: Samples, lost: FloatArray, intervals: Rows, half: int, sure: float) -> Rows:
     """Return intervals near those given that, two by two, make the motion around smooth when a sample is put in."""
-    pairs: list[int] = []
+    pairs = []
     groups = np.split(intervals, np.flatnonzero(np.diff(intervals) > half) + 1) if len(intervals) else []
     if len(groups) > _MOST_PAIRS:
         return NO_ROWS
@@ -139,8 +140,7 @@ def _pairs(samples: Samples, lost: FloatArray, intervals: Rows, half: int, sure:
                 loss[interval - rows[0]] += 1
         time = np.arange(len(rows)) + np.cumulative_sum(losses, axis=1, include_initial=True)
         time = (time - time[:, width : width + 1]) / width
-        design = np.stack([time**power for power in range(5)], axis=2)
-        basis, _ = np.linalg.qr(design)
+        basis, _ = np.linalg.qr(np.stack([time**power for power in range(5)], axis=2))
         cost = np.zeros(len(trials))
         for sensor in samples.sensors.values():
             values = (sensor.values[rows] - sensor.values[rows].mean(axis=0)) / np.maximum(sensor.noise, 1e-300)
@@ -280,8 +280,7 @@ def steps(sensor: Sensor) -> FloatArray:
     windows = np.lib.stride_tricks.sliding_window_view(sensor.values, 4, axis=0)
     miss = np.zeros_like(sensor.difference)
     miss[3:-3] = windows[4:] @ weight[::-1] - windows[:-4] @ weight
-    broken = np.flatnonzero(~sensor.even)
-    miss[np.clip(broken[:, None] + np.arange(-4, 5), 0, len(miss) - 1)] = 0.0
+    miss[np.clip(np.flatnonzero(~sensor.even)[:, None] + np.arange(-4, 5), 0, len(miss) - 1)] = 0.0
     scale = np.maximum(scale_around(miss, before=False), 1.8 * sensor.noise)
     return np.max(np.abs(miss) / np.maximum(scale, 1e-300), axis=1)
 
@@ -329,22 +328,20 @@ def _clean(sensor: Sensor, index: int) -> bool:
     return bool(jump[axis] > max(5 * bend[axis], least, 15 * sensor.noise[axis]))
 
 
-def _reported(samples: Samples, jumps: Rows) -> list[Finding]:
+def _reported(samples: Samples, jumps: Rows) -> Iterator[Finding]:
     sensor = samples.first
     if not 0 < len(jumps) <= max(20, 1e-3 * len(sensor)):
-        return []
+        return
     # wide enough that the turn counts as interrupted
     half = max(3, int(np.ceil(_BESIDE / sensor.period)))
     rows = np.unique(np.clip(jumps[:, None] + np.arange(1 - half, 1 + half), 0, len(sensor) - 1))
     where = ", ".join(sensor.at(jump) for jump in jumps[:3]) + (" …" if len(jumps) > 3 else "")
-    return [
-        Finding(
-            "data.lost_samples",
-            sensor.rows(jumps + 1),
-            f"At {where} both sensors jump in the middle of a motion: "
-            "samples are missing there although the stamps go on evenly. The turns concerned are left out; how much "
-            "time is missing cannot be determined from the samples.",
-            rivals=("data.order", "data.duplicate"),
-            without=dict.fromkeys(samples.sensors, rows),
-        )
-    ]
+    yield Finding(
+        "data.lost_samples",
+        sensor.rows(jumps + 1),
+        f"At {where} both sensors jump in the middle of a motion: "
+        "samples are missing there although the stamps go on evenly. The turns concerned are left out; how much "
+        "time is missing cannot be determined from the samples.",
+        rivals=("data.order", "data.duplicate"),
+        without=dict.fromkeys(samples.sensors, rows),
+    )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
@@ -32,24 +34,22 @@ _SHIFT = 12.0
 """Standard deviations of the means at rest by which another device's bias must differ."""
 
 
-def find(samples: Samples) -> list[Finding]:
+def find(samples: Samples) -> Iterator[Finding]:
     """Return two sensors that never moved together, or one device's rows after another's."""
-    return _unrelated(samples) or _changed(samples)
+    yield from _unrelated(samples) or _changed(samples)
 
 
 def _unrelated(samples: Samples) -> list[Finding]:
-    both = samples.both
-    if both is None or not samples.posed:
+    if samples.both is None or not samples.posed:
         return []
-    force, rate = both
     clocks = samples.clocks
     explained = 0.0 if clocks is None else clocks.explained
     if explained <= _CLEARLY:  # a line of lags may miss what no lag explains
-        explained = max(explained, turning(force.time, force.values, rate.time, rate.values).explained)
+        explained = max(explained, turning(*samples.outputs).explained)
     if explained > _CLEARLY:
         return []
     # accelerations on the way hide how gravity turns, and do not matter from rest to rest
-    whole = carried(force.time, force.values, rate.time, rate.values, samples.rests)
+    whole = carried(*samples.outputs, rests=samples.rests)
     if whole.turns < _FEWEST_TURNS:
         return []
     factor = abs(whole.factor)
@@ -93,46 +93,43 @@ def _rests(accelerometer: Sensor, gyroscope: Sensor) -> FloatArray:
         # a fast phase without any rest is not the noise of another device
         floor = np.clip(floor, 1e-30, 25 * np.percentile(total, 5) + 1e-30)
         calm = total <= 5 * floor
-        moved = lengths_of(np.diff(mean, axis=0)) > 6 * np.sqrt(np.minimum(floor[1:], floor[:-1]))
-        leave_out_both(calm, moved)
+        leave_out_both(calm, lengths_of(np.diff(mean, axis=0)) > 6 * np.sqrt(np.minimum(floor[1:], floor[:-1])))
         still &= sensor.by_sample(calm)[sensor.next_to(accelerometer.time)]
     return spans_of(still, accelerometer.time, 0.7)
 
 
-def _changed(samples: Samples) -> list[Finding]:
+def _changed(samples: Samples) -> Iterator[Finding]:
     """A row from which on biases are others in both sensors at once, or biases and noise."""
     if samples.both is None:
-        return []
+        return
     accelerometer, gyroscope = samples.both
     if len(accelerometer) < 200:
-        return []
+        return
     rests = _rests(accelerometer, gyroscope)
     if len(rests) < 8:
-        return []
+        return
     means, noises = [], []
     for sensor in (accelerometer, gyroscope):
         edges = np.searchsorted(sensor.time, rests + [[0.1, -0.1]])
         means.append(of_each(np.mean, sensor.values, edges))
-        size = np.sqrt(of_each(np.mean, sensor.curvature**2, edges))
-        noises.append(np.log(np.maximum(size, 1e-12)))
+        noises.append(np.log(np.maximum(np.sqrt(of_each(np.mean, sensor.curvature**2, edges)), 1e-12)))
     norm = np.log(np.maximum(lengths_of(means[0]), 1e-9))[:, None]
     rate, noise = means[1], np.hstack(noises)
     distance, rest = _furthest(norm, 3, len(rests) - 2)
     factor = np.exp(np.median(norm[rest:]) - np.median(norm[:rest]))
     if not 0.6 < factor < 1.6 and distance > _SHIFT:
-        return [
-            Finding(
-                "data.units",
-                accelerometer.rows([int(np.searchsorted(accelerometer.time, rests[rest - 1, 1]))]),
-                f"From about {rests[rest, 0]:.1f} s on, the accelerometer's norm at rest is {factor:.3g} times what it "
-                "was before: the unit changes within the file, or the range does. Cut it there.",
-                spoils=True,
-                refuses="accelerometer",
-            )
-        ]
+        yield Finding(
+            "data.units",
+            accelerometer.rows([int(np.searchsorted(accelerometer.time, rests[rest - 1, 1]))]),
+            f"From about {rests[rest, 0]:.1f} s on, the accelerometer's norm at rest is {factor:.3g} times what it "
+            "was before: the unit changes within the file, or the range does. Cut it there.",
+            spoils=True,
+            refuses="accelerometer",
+        )
+        return
     distance, rest = _furthest(rate, 3, len(rests) - 2)
     if distance < _SHIFT:
-        return []
+        return
     # somewhere about that rest both sensors step in one sample, or the noise changes with it
     window = slice(*np.searchsorted(gyroscope.time, [rests[rest - 2, 0] - 0.5, rests[rest + 1, 1]]))
     noisier, _ = _furthest(noise, max(3, rest - 1), min(rest + 2, len(rests) - 2))
@@ -143,18 +140,16 @@ def _changed(samples: Samples) -> list[Finding]:
         sudden = len(both) > 0 and both.max() > 8.0
         row = window.start + int(np.argmax(both)) + 1 if sudden else row
     if not sudden and noisier < 5.0:
-        return []
-    return [
-        Finding(
-            "data.mixed_devices",
-            accelerometer.rows([row]),
-            f"From about {accelerometer.time[row]:.1f} s on, the gyroscope's bias and "
-            + ("the noise of both sensors" if noisier > 5.0 else "the accelerometer's output")
-            + " are others: the rows before and after come from different devices or settings, or it was switched "
-            "off in between. Cut the recording there.",
-            spoils=True,
-        )
-    ]
+        return
+    yield Finding(
+        "data.mixed_devices",
+        accelerometer.rows([row]),
+        f"From about {accelerometer.time[row]:.1f} s on, the gyroscope's bias and "
+        + ("the noise of both sensors" if noisier > 5.0 else "the accelerometer's output")
+        + " are others: the rows before and after come from different devices or settings, or it was switched "
+        "off in between. Cut the recording there.",
+        spoils=True,
+    )
 
 
 def _furthest(values: FloatArray, first: int, stop: int) -> tuple[float, int]:

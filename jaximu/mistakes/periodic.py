@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import scipy
 
@@ -17,25 +19,23 @@ from jaximu.recordings.recording import runs_of
 TITLES = {"data.periodic": "periodic disturbance", "data.bandwidth": "low-pass filter"}
 
 
-def find(samples: Samples) -> list[Finding]:
+def find(samples: Samples) -> Iterator[Finding]:
     """Return lines in the spectrum at rest, and a spectrum that falls off far below half the rate."""
-    findings = []
     for sensor in samples.sensors.values():
         parts = _still_parts(samples, sensor)
         if parts is None or len(parts) < 6:
             continue
         spectrum = np.fft.rfft(parts.swapaxes(1, 2) * np.hanning(parts.shape[1]), axis=2)
         power = np.mean(spectrum.real**2 + spectrum.imag**2, axis=0).T
-        findings += _lines(sensor, parts, power)
-        findings += _bandwidth(samples, sensor, power, parts.shape[1])
-    return findings
+        yield from _lines(sensor, parts, power)
+        yield from _bandwidth(samples, sensor, power, parts.shape[1])
 
 
-def _lines(sensor: Sensor, parts: FloatArray, power: FloatArray) -> list[Finding]:
+def _lines(sensor: Sensor, parts: FloatArray, power: FloatArray) -> Iterator[Finding]:
     """Sharp lines in the spectrum (f, 3) of the quieter half of the recording."""
     if len(parts) < 12:
-        return []
-    width, findings = parts.shape[1], []
+        return
+    width = parts.shape[1]
     for axis, density in enumerate(power.T):
         noisy = np.median(density) > 1e-20 * np.mean(sensor.values[:, axis] ** 2)
         if sensor.coarse[axis] is not None or not noisy:
@@ -46,17 +46,13 @@ def _lines(sensor: Sensor, parts: FloatArray, power: FloatArray) -> list[Finding
         # a bin's mean over k blocks is gamma with shape k (windowed blocks do not overlap)
         if ratio > 4 and gamma_mean_sf(ratio, len(parts)) * len(power) < 1e-6:
             frequency = peak * sensor.rate / width
-            amplitude = 2 * np.sqrt(density[peak]) / np.sum(np.hanning(width))
-            high = size(float(amplitude), sensor.unit, 2)
-            findings.append(
-                Finding(
-                    "data.periodic",
-                    (),
-                    f"{sensor.name} {'xyz'[axis]}: a line near {frequency:.3g} Hz of about {high} at rest, "
-                    f"{ratio:.0f} times the noise around it: a motor, the mains, or an alias of one.",
-                )
+            high = size(float(2 * np.sqrt(density[peak]) / np.sum(np.hanning(width))), sensor.unit, 2)
+            yield Finding(
+                "data.periodic",
+                (),
+                f"{sensor.name} {'xyz'[axis]}: a line near {frequency:.3g} Hz of about {high} at rest, "
+                f"{ratio:.0f} times the noise around it: a motor, the mains, or an alias of one.",
             )
-    return findings
 
 
 _LOBE = 2
@@ -92,14 +88,14 @@ _SLOPE = -1.2
 """Slope of the logarithm of the density over that of frequency in the upper part: white noise has 0, one pole −2."""
 
 
-def _bandwidth(samples: Samples, sensor: Sensor, power: FloatArray, width: int) -> list[Finding]:
+def _bandwidth(samples: Samples, sensor: Sensor, power: FloatArray, width: int) -> Iterator[Finding]:
     """A spectrum (f, 3), of parts of so many samples, that falls off far below half the rate."""
     if held_at(sensor) is not None or interpolated_at(sensor) is not None:
-        return []
+        return
     if np.any(sensor.noise < 3 * sensor.step) and any(sensor.coarse):
-        return []
+        return
     if not samples.posed and not samples.rested:  # what looks quiet on a vehicle is vibration, which is no white noise
-        return []
+        return
     floor = sensor.step**2 / 12 * np.sum(np.hanning(width) ** 2)
     frequency = np.arange(len(power)) * sensor.rate / width
     half = sensor.rate / 2
@@ -120,7 +116,7 @@ def _bandwidth(samples: Samples, sensor: Sensor, power: FloatArray, width: int) 
         if (slope < _SLOPE or deep) and corner < min(0.45 * half, _HARMLESS):
             corners.append(corner)
     if len(corners) < 3 or max(corners) > 2 * min(corners):  # a filter acts on all axes alike
-        return []
+        return
     corner = float(np.median(corners))
     spoils = corner < 4.0 and not samples.rested
     cure = "Turn slowly, or choose a wider filter."
@@ -128,16 +124,14 @@ def _bandwidth(samples: Samples, sensor: Sensor, power: FloatArray, width: int) 
         cure = "What it took away is not known; a wider filter shows it."
     elif spoils:
         cure = "Turns are quicker than that: choose a filter of 20 Hz or more, and record again."
-    return [
-        Finding(
-            "data.bandwidth",
-            (),
-            f"{sensor.name}: its noise at rest falls off above some {corner:.2g} Hz, far below the {half:.4g} Hz that "
-            f"{sensor.rate:.4g} samples a second could show: a low-pass filter is on. {cure}",
-            spoils=spoils,
-            numbers={sensor.name: corner},
-        )
-    ]
+    yield Finding(
+        "data.bandwidth",
+        (),
+        f"{sensor.name}: its noise at rest falls off above some {corner:.2g} Hz, far below the {half:.4g} Hz that "
+        f"{sensor.rate:.4g} samples a second could show: a low-pass filter is on. {cure}",
+        spoils=spoils,
+        numbers={sensor.name: corner},
+    )
 
 
 def _still_parts(samples: Samples, sensor: Sensor) -> FloatArray | None:

@@ -227,9 +227,9 @@ def _repeats(finding: Finding, before: Sequence[Finding]) -> bool:
     """Whether a finding only repeats what an earlier one says: gaps that were made, lines that a filter makes."""
     if finding.name == "data.dead_axis":
         return any(other.name == "data.stuck_axis" and _subject(other) == _subject(finding) for other in before)
-    if finding.name == "data.lost_samples" and not finding.repair:  # the same row
-        if any(other.name == "data.mixed_devices" for other in before):
-            return True
+    same_row = finding.name == "data.lost_samples" and not finding.repair
+    if same_row and any(other.name == "data.mixed_devices" for other in before):
+        return True
     filled_in = finding.name in ("data.bandwidth", "data.lost_samples")
     return filled_in and any("repeat the row before" in other.text for other in before)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from jaximu.ground.quantities import size
 from jaximu.mistakes.base import Samples, coarse_step
 from jaximu.mistakes.held_at_rest import zeroed_at_rest
@@ -11,11 +13,10 @@ from jaximu.recordings.finding import Finding
 TITLES = {"data.quantisation": "coarse steps"}
 
 
-def find(samples: Samples) -> list[Finding]:
+def find(samples: Samples) -> Iterator[Finding]:
     """Return the axes whose steps are coarser than their noise."""
     if zeroed_at_rest(samples) is not None:
-        return []
-    findings = []
+        return
     for name, sensor in samples.sensors.items():
         if held_at(sensor) is not None:
             continue
@@ -24,14 +25,11 @@ def find(samples: Samples) -> list[Finding]:
         if coarse:
             scale, unit = sensor.signal.nominal_scale, sensor.signal.unit
             sizes = [size(step * scale[axis], unit) for axis, step in coarse.items()]
-            findings.append(
-                Finding(
-                    "data.quantisation",
-                    (),
-                    f"{name} {', '.join('xyz'[axis] for axis in coarse)}: its step of "
-                    f"{' or '.join(dict.fromkeys(sizes))} is coarser than its noise; averages over a pose gain "
-                    "little. Choose a smaller range, or log unrounded "
-                    "values.",
-                )
+            yield Finding(
+                "data.quantisation",
+                (),
+                f"{name} {', '.join('xyz'[axis] for axis in coarse)}: its step of "
+                f"{' or '.join(dict.fromkeys(sizes))} is coarser than its noise; averages over a pose gain "
+                "little. Choose a smaller range, or log unrounded "
+                "values.",
             )
-    return findings

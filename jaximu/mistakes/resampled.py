@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from jaximu.mistakes.base import Samples, Sensor
@@ -10,9 +12,8 @@ from jaximu.recordings.finding import Finding, Rows
 TITLES = {"data.resampled": "resampled output"}
 
 
-def find(samples: Samples) -> list[Finding]:
+def find(samples: Samples) -> Iterator[Finding]:
     """Return the sensors whose real rate is lower than the log's."""
-    findings = []
     for name, sensor in samples.sensors.items():
         if len(sensor) < 200:
             continue
@@ -23,17 +24,14 @@ def find(samples: Samples) -> list[Finding]:
             continue
         real = (len(kept) - 1) / (sensor.time[kept[-1]] - sensor.time[kept[0]])
         rows = np.setdiff1d(np.arange(len(sensor)), kept)
-        findings.append(
-            Finding(
-                "data.resampled",
-                sensor.rows(rows),
-                f"{name}: the log has {sensor.rate:.4g} Hz but {how}: the sensor's real rate is {real:.4g} Hz. The "
-                "rows in between are no measurements and are left out; log at the sensor's rate, and choose one of "
-                "50 Hz or more.",
-                without={name: rows},
-            )
+        yield Finding(
+            "data.resampled",
+            sensor.rows(rows),
+            f"{name}: the log has {sensor.rate:.4g} Hz but {how}: the sensor's real rate is {real:.4g} Hz. The "
+            "rows in between are no measurements and are left out; log at the sensor's rate, and choose one of "
+            "50 Hz or more.",
+            without={name: rows},
         )
-    return findings
 
 
 def held_at(sensor: Sensor) -> Rows | None:
@@ -62,8 +60,7 @@ def interpolated_at(sensor: Sensor) -> Rows | None:
     scale = np.sqrt(np.mean(bend**2, axis=0))
     if not np.all(scale > 1e-12 * np.maximum(np.max(np.abs(sensor.values), axis=0), 1e-300)):
         return None
-    tolerance = np.maximum(1.01 * np.minimum(sensor.step, 0.1 * scale), 1e-3 * scale)
-    bent = (bend > tolerance).any(axis=1)
+    bent = (bend > np.maximum(1.01 * np.minimum(sensor.step, 0.1 * scale), 1e-3 * scale)).any(axis=1)
     if not 0.01 < bent.mean() < 0.6:
         return None
     knots = np.flatnonzero(bent) + 1

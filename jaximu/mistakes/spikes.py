@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import scipy
 
@@ -34,9 +36,8 @@ _LEAST, _HALF = 4.0, 0.5
 """Standard deviations, of the accelerometer's noise, of a turn that gravity shows; the share of it that may be left."""
 
 
-def find(samples: Samples) -> list[Finding]:
+def find(samples: Samples) -> Iterator[Finding]:
     """Return the samples that stand out from both sides."""
-    findings = []
     for name, sensor in samples.sensors.items():
         if name == "gyroscope" and sensor.dead_band is not None:  # what leaves the band is no outlier
             continue
@@ -48,15 +49,13 @@ def find(samples: Samples) -> list[Finding]:
         if not len(rows):
             continue
         largest = size(float(np.max(np.abs(sensor.curvature[rows]))), sensor.unit)
-        findings.append(
-            Finding(
-                "data.spikes",
-                sensor.rows(rows),
-                f"{name}: {counted(len(rows), 'outlier')} of up to {largest} against the neighbours, first "
-                f"after {sensor.at(rows[0])}: knocks, or errors of transfer. They are left out; up to "
-                f"{BRIDGED} in a row are bridged by interpolation.",
-                without={name: rows},
-            )
+        yield Finding(
+            "data.spikes",
+            sensor.rows(rows),
+            f"{name}: {counted(len(rows), 'outlier')} of up to {largest} against the neighbours, first "
+            f"after {sensor.at(rows[0])}: knocks, or errors of transfer. They are left out; up to "
+            f"{BRIDGED} in a row are bridged by interpolation.",
+            without={name: rows},
         )
     for name in ("temperature", "ambient_temperature"):
         signal = samples.recording.signals.get(name)
@@ -66,8 +65,7 @@ def find(samples: Samples) -> list[Finding]:
             f"{name.replace('_', ' ')}: {counted(len(rows), 'reading')} far from those before and after, first "
             f"{signal.values[rows[0], 0]:.4g}, as a thermometer gives for an error of transfer. They are left out."
         )
-        findings.append(Finding("data.spikes", (int(rows[0]) + 1,), text, without={name: rows}))
-    return findings
+        yield Finding("data.spikes", (int(rows[0]) + 1,), text, without={name: rows})
 
 
 def _wild(celsius: FloatArray) -> Rows:
@@ -86,15 +84,14 @@ def _outliers(sensor: Sensor) -> Rows:
         return NO_ROWS
     scale = np.maximum(sensor.local, 1.4 * sensor.noise + 0.5 * sensor.step)
     scale = np.maximum(scale, 1e-9 * np.ptp(sensor.values, axis=0))
-    ratio = np.max(np.abs(sensor.curvature) / np.maximum(scale, 1e-300), axis=1)
-    flagged = ratio > _TIMES
+    flagged = np.max(np.abs(sensor.curvature) / np.maximum(scale, 1e-300), axis=1) > _TIMES
     if not flagged.any():
         return NO_ROWS
     flagged[1:-1] |= flagged[:-2] & flagged[2:]
     clusters = runs_of(flagged)
     if len(clusters) > _MOST:
         return NO_ROWS
-    rows: list[int] = []
+    rows = []
     for start, stop in clusters:
         if stop - start <= 2 * BRIDGED + 3:
             rows += _shortest(sensor.values, scale, int(start), int(stop), sensor.rate)
@@ -159,6 +156,6 @@ def _turned(accelerometer: Sensor, gyroscope: Sensor, run: Rows) -> bool:
         for turn, later in zip(turns, force[1:], strict=True):
             attitude = attitude * turn
             carried.append(attitude.apply(later))
-        steps.append(float(np.linalg.norm(estimate @ np.array(carried)[beside])))
-    noise = float(np.linalg.norm(estimate) * np.linalg.norm(accelerometer.noise))
-    return steps[1] > _LEAST * noise and steps[0] < _HALF * steps[1]
+        steps.append(np.linalg.norm(estimate @ np.array(carried)[beside]))
+    noise = np.linalg.norm(estimate) * np.linalg.norm(accelerometer.noise)
+    return bool(steps[1] > _LEAST * noise and steps[0] < _HALF * steps[1])

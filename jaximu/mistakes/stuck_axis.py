@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from jaximu.ground.array_types import BoolArray
@@ -42,7 +44,7 @@ def _stuck(sensor: Sensor) -> list[Finding]:
     findings = [finding for axis in axes if (finding := _stuck_axis(sensor, change, axis)) is not None]
     if held_at(sensor) is not None or sensor.dead_band is not None:
         return findings
-    return findings + _repeated_rows(sensor, change)
+    return [*findings, *_repeated_rows(sensor, change)]
 
 
 def _stuck_axis(sensor: Sensor, change: BoolArray, axis: int) -> Finding | None:
@@ -76,37 +78,30 @@ def _stuck_axis(sensor: Sensor, change: BoolArray, axis: int) -> Finding | None:
     return Finding("data.stuck_axis", sensor.rows(first), text, spoils=most and noisy, without=without)
 
 
-def _repeated_rows(sensor: Sensor, change: BoolArray) -> list[Finding]:
+def _repeated_rows(sensor: Sensor, change: BoolArray) -> Iterator[Finding]:
     """Return where all axes repeat a row: for long, so that the sensor hung, and now and then; `change` (n − 1, 3)."""
-    findings = []
     same = ~change.any(axis=1) & ~at_limits(sensor)[1:]
     coarse = [step is not None for step in sensor.coarse]
     hung = _hung(sensor, same)
     if len(hung) and not all(coarse):
         first, rows = hung[:, 0], _repeating(hung)
-        findings.append(
-            Finding(
-                "data.stuck_axis",
-                sensor.rows(first),
-                f"{sensor.name}: all axes repeat one row for {len(rows) / sensor.rate:.3g} s in all, first after "
-                f"{sensor.at(first[0])}: the sensor or its driver hung, or samples were lost and filled in. These "
-                "rows are left out.",
-                without={sensor.name: rows},
-            )
+        yield Finding(
+            "data.stuck_axis",
+            sensor.rows(first),
+            f"{sensor.name}: all axes repeat one row for {len(rows) / sensor.rate:.3g} s in all, first after "
+            f"{sensor.at(first[0])}: the sensor or its driver hung, or samples were lost and filled in. These "
+            "rows are left out.",
+            without={sensor.name: rows},
         )
         same[rows - 1] = False
-    alone = np.min(np.mean(~change, axis=0))
-    if max(0.02, 0.6 * alone) < np.mean(same) < 1 and not any(coarse):
+    if max(0.02, 0.6 * np.min(np.mean(~change, axis=0))) < np.mean(same) < 1 and not any(coarse):
         rows = np.flatnonzero(same) + 1
-        findings.append(
-            Finding(
-                "data.stuck_axis",
-                sensor.rows(rows),
-                f"{sensor.name}: {100 * np.mean(same):.0f} % of the rows repeat the row before them: the log is faster "
-                "than the sensor, or samples were lost and filled in.",
-            )
+        yield Finding(
+            "data.stuck_axis",
+            sensor.rows(rows),
+            f"{sensor.name}: {100 * np.mean(same):.0f} % of the rows repeat the row before them: the log is faster "
+            "than the sensor, or samples were lost and filled in.",
         )
-    return findings
 
 
 def _hung(sensor: Sensor, same: BoolArray) -> Rows:

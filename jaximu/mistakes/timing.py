@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 
@@ -39,66 +40,57 @@ def find(samples: Samples) -> list[Finding]:
     return findings
 
 
-def _timing(name: str, sensor: Sensor) -> list[Finding]:
+def _timing(name: str, sensor: Sensor) -> Iterator[Finding]:
     interval = sensor.interval
     usual = sensor.period
     mean = np.mean(interval)
-    findings = []
     if in_bursts(interval):
         rate, lag = 1 / _clock(sensor.time)[1], np.quantile(interval, 0.99)
-        return [
-            Finding(
-                "data.bursts",
-                sensor.rows(np.flatnonzero(interval > 1.8 * mean)[:5] + 1),
-                f"{name}: the stamps come in bursts, {lag * 1e3:.3g} ms apart: they are the times of arrival at the "
-                f"host. A steady clock of {rate:.5g} Hz fitted to them replaces them; let the sensor's own clock be "
-                "logged if it can be.",
-                apply=steady_clock,
-            )
-        ]
+        yield Finding(
+            "data.bursts",
+            sensor.rows(np.flatnonzero(interval > 1.8 * mean)[:5] + 1),
+            f"{name}: the stamps come in bursts, {lag * 1e3:.3g} ms apart: they are the times of arrival at the "
+            f"host. A steady clock of {rate:.5g} Hz fitted to them replaces them; let the sensor's own clock be "
+            "logged if it can be.",
+            apply=steady_clock,
+        )
+        return
     if not _SLOWEST <= 1 / mean <= FASTEST:
-        findings.append(
-            Finding(
-                "data.time_scale",
-                (),
-                f"{name}: {len(sensor)} samples in {sensor.time[-1] - sensor.time[0]:.4g} s are {1 / mean:.3g} a "
-                "second: the unit of the time column is wrong. Change it in the header or with --columns.",
-                spoils=True,
-            )
+        yield Finding(
+            "data.time_scale",
+            (),
+            f"{name}: {len(sensor)} samples in {sensor.time[-1] - sensor.time[0]:.4g} s are {1 / mean:.3g} a "
+            "second: the unit of the time column is wrong. Change it in the header or with --columns.",
+            spoils=True,
         )
     spread = np.std(interval[interval < 1.5 * usual])
     uneven = spread > 0.1 * usual
     gaps = np.flatnonzero(interval > (2.5 if uneven else GAP) * usual)
     if len(gaps):
         lost = int(np.sum(np.round(interval[gaps] / usual) - 1))
-        findings.append(
-            Finding(
-                "data.gap",
-                sensor.rows(gaps + 1),
-                f"{name}: {counted(len(gaps), 'gap')}, {counted(lost, 'sample')} missing, the longest "
-                f"{interval.max():.3g} s, after {sensor.time[gaps[np.argmax(interval[gaps])]]:.1f} s. Turns across "
-                "long gaps are left out.",
-            )
+        yield Finding(
+            "data.gap",
+            sensor.rows(gaps + 1),
+            f"{name}: {counted(len(gaps), 'gap')}, {counted(lost, 'sample')} missing, the longest "
+            f"{interval.max():.3g} s, after {sensor.time[gaps[np.argmax(interval[gaps])]]:.1f} s. Turns across "
+            "long gaps are left out.",
         )
     if uneven:
         even = _smoother_evenly(sensor)
-        findings.append(
-            Finding(
-                "data.jitter",
-                (),
-                f"{name}: stamps jitter by {1e3 * spread:.2g} ms from sample to sample, {100 * spread / usual:.0f} % "
-                "of "
-                + (
-                    "the interval, and the samples are smooth at even times: a steady clock fitted to the stamps "
-                    "replaces them."
-                    if even
-                    else "the interval. If the sensor samples evenly, its own clock is better than the "
-                    "logger's: leave the time column out (_ in --columns) and give --rate."
-                ),
-                apply=_evenly if even else None,
-            )
+        yield Finding(
+            "data.jitter",
+            (),
+            f"{name}: stamps jitter by {1e3 * spread:.2g} ms from sample to sample, {100 * spread / usual:.0f} % "
+            "of "
+            + (
+                "the interval, and the samples are smooth at even times: a steady clock fitted to the stamps "
+                "replaces them."
+                if even
+                else "the interval. If the sensor samples evenly, its own clock is better than the "
+                "logger's: leave the time column out (_ in --columns) and give --rate."
+            ),
+            apply=_evenly if even else None,
         )
-    return findings
 
 
 def _even(time: FloatArray) -> FloatArray | None:
@@ -108,8 +100,7 @@ def _even(time: FloatArray) -> FloatArray | None:
     interval = np.diff(time)
     breaks = np.flatnonzero(interval > 2.5 * np.median(interval)) + 1
     number = np.arange(len(time), dtype=np.float64)
-    edges = [0, *breaks, len(time)]
-    slopes = [np.polyfit(number[a:b], time[a:b], 1)[0] for a, b in pairwise(edges) if b - a > 100]
+    slopes = [np.polyfit(number[a:b], time[a:b], 1)[0] for a, b in pairwise([0, *breaks, len(time)]) if b - a > 100]
     if not slopes:
         return None
     period = np.median(slopes)
@@ -144,10 +135,9 @@ def _smoother_evenly(sensor: Sensor) -> bool:
         return False
     bends = []
     for time in (even, sensor.time):
-        slope = sensor.difference / np.diff(time)[:, None]
-        bend = np.abs(np.diff(slope, axis=0)).sum(axis=1) * sensor.period
+        bend = np.abs(np.diff(sensor.difference / np.diff(time)[:, None], axis=0)).sum(axis=1) * sensor.period
         moving = np.abs(sensor.difference[1:]).sum(axis=1) > 6 * np.sum(sensor.noise)
-        bends.append(float(np.median(bend[moving])) if moving.sum() > 50 else np.inf)
+        bends.append(np.median(bend[moving]) if moving.sum() > 50 else np.inf)
     return bends[0] < 0.8 * bends[1]
 
 
@@ -178,8 +168,7 @@ def _clock(time: FloatArray) -> tuple[FloatArray, float]:
     width = max(8, round(1.0 / max(slope, 1e-9)))
     if np.ptp(delay) > 20 * np.median(np.abs(delay)) + 1e-9:
         steps = np.diff(time)
-        breaks = np.flatnonzero(steps > 12 * np.quantile(steps, 0.99))
-        edges = np.concatenate([[0], breaks + 1, [len(time)]])
+        edges = np.concatenate([[0], np.flatnonzero(steps > 12 * np.quantile(steps, 0.99)) + 1, [len(time)]])
         parts = [np.polyfit(index[a:b], time[a:b], 1) for a, b in pairwise(edges) if b - a > width]
         if parts:
             slope = np.median([part[0] for part in parts])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
@@ -16,9 +18,8 @@ _AT_THE_OTHER_END = 0.8
 """Share of the samples that overflowed which come back in the half of the range that they did not leave by."""
 
 
-def find(samples: Samples) -> list[Finding]:
+def find(samples: Samples) -> Iterator[Finding]:
     """Return the axes that jump by their whole range and back."""
-    findings = []
     for name, sensor in samples.sensors.items():
         for axis in range(3):
             wrapped = _wrapped(sensor, axis)
@@ -26,8 +27,7 @@ def find(samples: Samples) -> list[Finding]:
                 continue
             turns, full, rows = wrapped
             # in the unit of the output: the recording keeps it
-            scale = sensor.signal.nominal_scale[axis]
-            added = turns * full * scale
+            added = turns * full * sensor.signal.nominal_scale[axis]
 
             def apply(recording: Recording, name: str = name, axis: int = axis, added: FloatArray = added) -> Recording:
                 values = np.array(getattr(recording, name).values)
@@ -35,19 +35,16 @@ def find(samples: Samples) -> list[Finding]:
                 return with_signal(recording, name, values=values)
 
             shown = f"{np.degrees(full):.4g} °/s" if name == "gyroscope" else f"{full:.4g} m/s²"
-            findings.append(
-                Finding(
-                    "data.wrap",
-                    sensor.rows(rows),
-                    f"{name} {'xyz'[axis]}: {counted(len(rows), 'sample')} jumped by the whole range of {shown} and "
-                    f"back, first after {sensor.at(rows[0])}: the integer overflowed. --repair adds the range "
-                    "back; without it these rows are left out.",
-                    repair="--repair",
-                    apply=apply,
-                    without={name: rows},
-                )
+            yield Finding(
+                "data.wrap",
+                sensor.rows(rows),
+                f"{name} {'xyz'[axis]}: {counted(len(rows), 'sample')} jumped by the whole range of {shown} and "
+                f"back, first after {sensor.at(rows[0])}: the integer overflowed. --repair adds the range "
+                "back; without it these rows are left out.",
+                repair="--repair",
+                apply=apply,
+                without={name: rows},
             )
-    return findings
 
 
 def _wrapped(sensor: Sensor, axis: int) -> tuple[FloatArray, float, Rows] | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from jaximu.ground.quantities import counted
@@ -20,7 +22,7 @@ _BEYOND = 6.0
 """Noise and steps by which the rows beside must lie off zero on an axis, all to one side."""
 
 
-def find(samples: Samples) -> list[Finding]:
+def find(samples: Samples) -> Iterator[Finding]:
     """Return the rows that are zero on all axes of a sensor although neighbouring rows are not."""
     nothing = {name: (sensor.signal.values == 0.0).all(axis=1) for name, sensor in samples.sensors.items()}
     without: dict[str, Rows] = {}
@@ -36,19 +38,17 @@ def find(samples: Samples) -> list[Finding]:
         if zero.any():
             without[name] = np.flatnonzero(zero)
     if not without:
-        return []
+        return
     first = samples.sensors[min(without, key=lambda name: without[name][0])]
     rows = np.unique(np.concatenate(list(without.values())))
     which = " and ".join(without)
-    return [
-        Finding(
-            "data.zeros",
-            first.rows(rows),
-            f"{which}: {counted(len(rows), 'row')} read zero on all axes, first after {first.at(rows[0])}: a "
-            "transfer failed, or the logger filled them in. They are left out.",
-            without=without,
-        )
-    ]
+    yield Finding(
+        "data.zeros",
+        first.rows(rows),
+        f"{which}: {counted(len(rows), 'row')} read zero on all axes, first after {first.at(rows[0])}: a "
+        "transfer failed, or the logger filled them in. They are left out.",
+        without=without,
+    )
 
 
 def _interrupted(sensor: Sensor, zero: np.ndarray) -> np.ndarray:
