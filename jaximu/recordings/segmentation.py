@@ -429,10 +429,6 @@ def noise_by_model(
     return np.diag(white * scale), slow.covariance(start, stop) * scale[:, None, None] * same
 
 
-def _pad(array: FloatArray, length: int, fill: float | FloatArray) -> FloatArray:
-    return np.concatenate([array, np.broadcast_to(fill, (length - len(array), *array.shape[1:]))])
-
-
 _Turn = tuple[FloatArray, FloatArray]
 """Gyroscope output (n, 3) and the seconds (n,) over which each sample holds."""
 _NO_TURN: _Turn = np.zeros((0, 3)), np.zeros(0)
@@ -454,8 +450,8 @@ def observed_poses(
     parts = [segmentations] if isinstance(segmentations, Segmentation) else list(segmentations)
     rests: list[dict[str, FloatArray]] = []
     spans: list[FloatArray] = []  # start and stop of the turn after each pose
-    turns: list[_Turn] = []
-    densities: list[FloatArray] = []
+    turns = []
+    densities = []
     first_rest: FloatArray | None = None
     for part in parts:
         recording, intervals = part.recording, part.intervals
@@ -547,7 +543,10 @@ def _padded(
         "temperature": REFERENCE_TEMPERATURE,
         "force": up,
     }
-    columns = {name: _pad(values, padded, fills.get(name, 0.0)) for name, values in columns.items()}
+    columns = {
+        name: np.concatenate([values, np.broadcast_to(fills.get(name, 0.0), (padded - poses, *values.shape[1:]))])
+        for name, values in columns.items()
+    }
     across = columns.pop("force")[1:, None, :]
     return Observations(
         poses=Poses(**columns, mask=np.arange(padded) < poses),
