@@ -124,7 +124,7 @@ def _of_ready(ready: Sequence[Prepared]) -> NoiseAnalysis:
     rates: dict[str, float] = {}
     corners = [finding.numbers for finding in chosen.findings if finding.name == "data.bandwidth"]
     for name in SENSOR_QUANTITIES:
-        if getattr(longest, name) is None or not len(getattr(longest, name)) or name in unusable:
+        if not getattr(longest, name) or name in unusable:
             continue
         corner = min((corner[name] for corner in corners if name in corner), default=None)
         try:

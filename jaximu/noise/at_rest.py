@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.mistakes import Prepared, prepared
 from jaximu.model.noise_model import AxisNoise, NoiseModel, fit_bank
@@ -43,7 +42,8 @@ def _of_ready(ready: Prepared) -> NoiseModel:
         what = f"{recording.name}: the {name}"
         values, rate = at_rest(recording, name)
         values = np.stack([filled(axis, BRIDGED) for axis in values])
-        whole = _longest_whole(values)
+        first, last = max(runs_of(np.asarray(np.isfinite(values).all(axis=0))), key=np.ptp)
+        whole = values[:, first:last]
         if whole.shape[1] < values.shape[1]:
             notes.append(
                 f"{what} has gaps: its noise is that of the longest part without, {whole.shape[1] / rate:.0f} of "
@@ -64,8 +64,3 @@ def _of_ready(ready: Prepared) -> NoiseModel:
                 notes.append(f"{what} is periodic at {heard} in the recording at rest; that is no noise, and left out.")
         axes[name] = fit_bank(whole, rate)
     return NoiseModel(axes["accelerometer"], axes.get("gyroscope"), tuple(notes))
-
-
-def _longest_whole(values: FloatArray) -> FloatArray:
-    first, last = max(runs_of(np.asarray(np.isfinite(values).all(axis=0))), key=np.ptp)
-    return values[:, first:last]

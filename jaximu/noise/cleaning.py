@@ -101,7 +101,7 @@ def periodic_lines(
     Trans. Inf. Theory 20, 1974), and what remains is searched again.
     """
     samples = len(values)
-    lines: list[PeriodicLine] = []
+    lines = []
     spans: list[tuple[int, int]] = []
     periodic = None
     rest, _ = without_line(values)
@@ -173,7 +173,7 @@ def _skirts(power: FloatArray, low: int, high: int) -> tuple[int, int]:
     levels = [np.median(side) / np.log(2) for side in sides if len(side) >= 16]
     if not levels:
         return low, high
-    limit = 2 * float(np.exp(np.mean(np.log(levels))))
+    limit = 2 * np.exp(np.mean(np.log(levels)))
     first, last = low, high
     while low > 0.85 * first and low > 8 and np.mean(power[low - 8 : low]) > limit:
         low -= 4
@@ -210,10 +210,8 @@ def _wave(values: FloatArray, peak: int, rate: float) -> tuple[PeriodicLine, Flo
     coarse = (values * turn * taper)[: blocks * size].reshape(blocks, size).sum(axis=1)
     middle = (np.arange(blocks) * size + (size - 1) / 2) / samples
 
-    def height(shift: float) -> float:
-        return -float(np.abs(np.sum(coarse * np.exp(-2j * np.pi * shift * middle))))
-
-    shift = lowest(height, (-1.0, 1.0), 1e-7)
+    # where the line is highest
+    shift = lowest(lambda at: -np.abs(np.sum(coarse * np.exp(-2j * np.pi * at * middle))), (-1.0, 1.0), 1e-7)
     turn = turn * np.exp(-2j * np.pi * shift / samples * index)
     phasor = 2 * np.sum(values * turn * taper) / np.sum(taper)
     return PeriodicLine((peak + shift) * rate / samples, float(np.abs(phasor))), np.asarray((phasor * turn.conj()).real)

@@ -495,11 +495,11 @@ class _Model:
 
         def largest(column: FloatArray) -> float:
             mean = np.bincount(spectrum.octave, spectrum.count * column)
-            return float(np.log(max(np.min(power[mean > 0] / mean[mean > 0]), 1e-290)))
+            return np.log(max(np.min(power[mean > 0] / mean[mean > 0]), 1e-290))
 
         theta = [largest(column) for column in self.columns.T]
         for time in self.times:
-            theta += [largest(_markov(spectrum, time) @ _WEIGHT), float(np.log(time))]
+            theta += [largest(_markov(spectrum, time) @ _WEIGHT), np.log(time)]
         return np.array(theta)
 
     def solve(self, theta: FloatArray, held: int | None = None, ramp: float | None = None) -> _Fit:
@@ -625,7 +625,7 @@ def _excess(general: _Fit, freedom: int) -> float:
     """Return the share by which octaves differ from the most general model, so that its misfit is its freedom."""
 
     def over(logarithm: float) -> float:
-        return replace(general.model, excess=float(np.exp(logarithm))).fit().misfit()[0] - freedom
+        return replace(general.model, excess=np.exp(logarithm)).fit().misfit()[0] - freedom
 
     low, high = np.log(1e-3), np.log(2.0)
     if over(low) <= 0:
@@ -689,10 +689,8 @@ def _limit(fit: _Fit, term: str, threshold: float) -> float:
     index = beside.model.letters.index(term)
     most = beside.model.start()[index]
 
-    def rise(at: float) -> float:
-        return beside.held(index, at) - threshold
-
-    return float(np.exp(_root(rise, max(beside.theta[index], most - 25), most + 12, 1e-2) / 2))
+    root = _root(lambda at: beside.held(index, at) - threshold, max(beside.theta[index], most - 25), most + 12, 1e-2)
+    return float(np.exp(root / 2))
 
 
 def _high_pass(general: _Fit, threshold: float) -> Term | None:
@@ -705,7 +703,7 @@ def _high_pass(general: _Fit, threshold: float) -> Term | None:
     grid = np.log(np.geomspace(_SHORTEST / spectrum.rate, spectrum.samples / spectrum.rate / 3, 16))
 
     def at(logarithm: float) -> _Fit:
-        passed = replace(spectrum, high_pass=float(np.exp(logarithm)))
+        passed = replace(spectrum, high_pass=np.exp(logarithm))
         return replace(general.model, spectrum=passed, terms=general.model.terms.replace("R", "")).fit()
 
     def loss(logarithm: float) -> float:

@@ -150,7 +150,7 @@ def _of_axis(parts: FloatArray, times: FloatArray, rate: float, axis: int) -> li
     hidden[:, :lobe] = hidden[:, -lobe:] = True
     odds = (_POWERS / (1 + _POWERS))[:, None, None] * ordinates - np.log1p(_POWERS)[:, None, None]
     odds = np.minimum(odds, _CAP)
-    lines: list[SpectralLine] = []
+    lines = []
     window = np.arange(count)
     while len(lines) < _MOST:
         odds = np.where(hidden, 0.0, odds)

@@ -35,13 +35,13 @@ def read_sensor_noise(path: FilePath) -> SensorNoise:
     name = os.fspath(path)
     if name.lower().endswith((".yaml", ".yml")):
         known = read_noise(path)
-        figures = {
-            triad: {"N": known.get(f"{triad}_noise_density"), "K": known.get(f"{triad}_random_walk")}
-            for triad in INERTIAL_QUANTITIES
-        }
         return {
-            triad: {term: np.full(3, value) for term, value in terms.items() if value}
-            for triad, terms in figures.items()
+            triad: {
+                term: np.full(3, known[f"{triad}_{key}"])
+                for term, key in (("N", "noise_density"), ("K", "random_walk"))
+                if f"{triad}_{key}" in known
+            }
+            for triad in INERTIAL_QUANTITIES
         }
     return sensor_noise(read_analysis(path), name)
 
