@@ -177,7 +177,6 @@ def accept(
     along = [limit for limit in limits.limits if limit.owner == "navigation"]
     navigated, on_the_path = navigation_items(along, limits.rule, calibration, noise, os.fspath(file))
     items += navigated
-    trace = calibration.trace
     notes = [f"{len(limits.limits)} limits on {len(items)} items."]
     if "temperature_range" not in calibration.data:
         warm = calibration.data.get("temperature")
@@ -193,7 +192,7 @@ def accept(
         limits.rule,
         os.fspath(file),
         {"file": limits.file, "sha256": limits.sha256},
-        trace,
+        calibration.trace,
         calibration.digest,
         tuple(notes),
     )

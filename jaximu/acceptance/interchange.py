@@ -172,9 +172,8 @@ def _measurement(row: Json) -> Json:
     }
     if row["value"] is None:
         return record | {"outcome": "UNSET"}
-    passed = row["verdict"] == PASS
     return record | {
-        "outcome": "PASS" if passed else "FAIL",
+        "outcome": "PASS" if row["verdict"] == PASS else "FAIL",
         "marginal": row["verdict"] == UNDECIDED,
         "measured_value": row["value"],
         "uncertainty": row["uncertainty"],

@@ -17,6 +17,7 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf, student_isf, student_two_sided
 from jaximu.ground.document import Json
+from jaximu.ground.vectors import sigmas_of
 
 _ROUNDING = 1e-12
 """Of the largest eigenvalue of a correlation matrix: what is below it is no direction of its own."""
@@ -47,7 +48,7 @@ def sameness(values: FloatArray, covariance: FloatArray) -> Sameness:
     count, size = values.shape
     contrasts = np.kron(_contrasts(np.ones((count, 1))), np.eye(size))
     difference, spread = contrasts @ values.ravel(), contrasts @ covariance @ contrasts.T
-    scale = np.sqrt(np.diagonal(spread))
+    scale = sigmas_of(spread)
     roots, vectors = np.linalg.eigh(spread / scale[:, None] / scale)
     kept = roots > _ROUNDING * roots[-1]
     along = vectors[:, kept].T @ (difference / scale)

@@ -131,7 +131,7 @@ class Consequences(Result, Document, page="consequences"):
         spans: list[tuple[str, float, float]] = []
         for time, index in zip(self.times, first, strict=True):
             start = spans.pop()[1] if spans and spans[-1][0] == names[index] else (spans[-1][2] if spans else 0.0)
-            spans.append((names[index], float(start), float(time)))
+            spans.append((names[index], start, float(time)))
         return spans
 
     def document(self) -> Json:
@@ -307,7 +307,7 @@ def prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> Run
     known = {_identity(name, imu): index for index, name in enumerate(everything)}
     rows = [row for row, name in enumerate(calibration.names) if _identity(name, calibration.imu) in known]
     indices = np.array([known[_identity(calibration.names[row], calibration.imu)] for row in rows], int)
-    covariance = submatrix(np.asarray(calibration.covariance), rows)
+    covariance = submatrix(calibration.covariance, rows)
     if not rows or not np.diagonal(covariance).any():
         raise NotPossibleError(
             f"{file} states no covariance, so what it leaves open is not known: calibrate the log again with "
@@ -356,11 +356,10 @@ def _variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
 
 def _given(covariance: FloatArray, chosen: BoolArray) -> FloatArray:
     """Covariance of the others were these known exactly (normal distribution, conditioned)."""
-    cross, inverse = (
-        covariance[np.ix_(~chosen, chosen)],
-        np.linalg.pinv(submatrix(covariance, chosen), hermitian=True),
+    cross = covariance[np.ix_(~chosen, chosen)]
+    return (
+        submatrix(covariance, ~chosen) - cross @ np.linalg.pinv(submatrix(covariance, chosen), hermitian=True) @ cross.T
     )
-    return covariance[np.ix_(~chosen, ~chosen)] - cross @ inverse @ cross.T
 
 
 def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
@@ -375,8 +374,9 @@ def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
     for triad, term in wanted:
         columns = reaction[..., :3] if triad == "gyroscope" else reaction[..., 3:]
         system = _PROCESSES[term](noise[triad][term]).system(interval)
-        variances, _ = propagate(transition, columns, system)
-        terms[f"{triad} {NOISE_WORDS[term]}"] = np.asarray(variances)[path.every - 1 :: path.every]
+        terms[f"{triad} {NOISE_WORDS[term]}"] = np.asarray(propagate(transition, columns, system)[0])[
+            path.every - 1 :: path.every
+        ]
     return terms
 
 

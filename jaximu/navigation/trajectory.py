@@ -16,7 +16,6 @@ import numpy as np
 
 from jaximu.calibration import Calibration, compensate
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.differences import midpoints
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.precision import require_float64
@@ -194,8 +193,8 @@ def of_specification(
 
     Its latitude and gravity hold where it states them, else those of `site`.
     """
-    document = dict(specification.document)
-    stated = dict(document.get("environment", {}))
+    document = specification.document
+    stated = document.get("environment", {})
     site = replace(site, latitude=float(stated.get("latitude", site.latitude)))
     environment = {"gravity": site.gravity.value} | stated | {"latitude": site.latitude}
     case = Specification(document | {"environment": environment}, specification.name).case(0)
@@ -204,7 +203,7 @@ def of_specification(
     longest = motion.samples(case.rate)
     count = longest if duration is None else min(longest, round(duration * case.rate))
     stimulus = part_of(whole, slice(count))
-    start = _start(np.asarray(motion.attitude[0]), site, float(motion.gravity))
+    start = _start(motion.attitude[0], site, float(motion.gravity))
     limits = {}
     for artefact in case.artefacts:
         for name in ("accelerometer", "gyroscope"):
@@ -243,8 +242,6 @@ def of_recording(recording: Recording, calibration: Calibration, site: Place, du
         rate = rate - rate[resting].mean(axis=0) + attitude_of(up).inv().apply(earth)
         notes.append(f"the motion starts at the log's first rest, {first:.1f} s in, levelled there; heading unknown.")
     kept = (time >= first) & (time < first + duration)
-    middle = midpoints(time)
-    edges = np.concatenate([[2 * time[0] - middle[0]], middle, [2 * time[-1] - middle[-1]]])
     temperature = ready.temperature
     warm = None if temperature is None else np.interp(time, temperature.time, temperature.values[:, 0])[kept]
     stimulus = Stimulus(force[kept], rate[kept], time=time[kept] - first, temperature=warm)
@@ -253,7 +250,7 @@ def of_recording(recording: Recording, calibration: Calibration, site: Place, du
     bend = np.diff(steps[steps < 2.5 * np.median(steps)])  # of white jitter its variance is six times
     jitter = float(np.sqrt(np.mean(bend**2) / 6)) if len(bend) else 0.0
     start = _start(attitude, site, gravity)
-    return Trajectory(start, stimulus, np.diff(edges)[kept], words, tuple(notes), True, jitter).cut()
+    return Trajectory(start, stimulus, np.gradient(time)[kept], words, tuple(notes), True, jitter).cut()
 
 
 def _first_rest(
