@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
 from jaximu.fleets.jobs import ONE_THREAD, PATIENCE, Job, Rows, Settings, batches, own_effects, register_all
 from jaximu.fleets.rows import row_begun, rows_of
@@ -117,17 +117,14 @@ def _begin(folder, effects: Sequence[str]) -> None:
 @contextmanager
 def _quiet_threads() -> Iterator[None]:
     """One thread a process: with as many processes as cores, more only get into each other's way."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    before = {name: os.environ[name] for name in ONE_THREAD if name in os.environ}
     os.environ.update(ONE_THREAD)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                with suppress(KeyError):
-                    del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in ONE_THREAD:
+            os.environ.pop(name, None)
+        os.environ.update(before)
 
 
 def _ray(jobs: Sequence[Job], places: Sequence[int], settings: Settings, workers: int) -> Iterator[Rows]:

@@ -137,9 +137,8 @@ class Shifts:
         """Return what is to be taken off (n, p) to make units of all lots and dates alike."""
         none = np.zeros_like(self.drift)
         lots = np.array([self.lots.get(row["lot"] or "", none) for row in rows]).reshape(len(rows), len(none))
-        return (
-            lots + np.nan_to_num((days_of([row["date"] for row in rows]) - self.middle) / _YEAR)[:, None] * self.drift
-        )
+        years = (days_of([row["date"] for row in rows]) - self.middle) / _YEAR
+        return lots + np.outer(np.nan_to_num(years), self.drift)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -270,11 +269,11 @@ class _Units:
     offset: FloatArray
 
 
-def _units(rows: Sequence[Json], gyroscope: bool) -> _Units:
+def _units(rows: list[Json], gyroscope: bool) -> _Units:
     """Bring calibrated rows to one scale: gains in nominal scales, biases as inputs in SI."""
     indices = free_places(gyroscope)
     count, size = len(rows), len(PARAMETERS)
-    raw, factor, offset = np.zeros((count, size)), np.ones((count, size)), np.zeros((count, size))
+    factor, (raw, offset) = np.ones((count, size)), np.zeros((2, count, size))
     for name, part in list(COLUMN_PLACES.items())[: 2 + 2 * gyroscope]:
         scale, zero = np.split(np.array([row[f"{name.partition('_')[0]}_nominal"] for row in rows], float), 2, axis=1)
         raw[:, part] = np.array([row[name] for row in rows], float)
@@ -285,7 +284,7 @@ def _units(rows: Sequence[Json], gyroscope: bool) -> _Units:
     relative = (raw - offset) / factor
     grid = np.ix_(range(count), indices, indices)
     return _Units(
-        tuple(PARAMETERS[index] for index in indices), relative[:, indices], whole[grid], list(rows), factor, offset
+        tuple(PARAMETERS[index] for index in indices), relative[:, indices], whole[grid], rows, factor, offset
     )
 
 

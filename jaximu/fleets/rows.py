@@ -257,9 +257,8 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> Js
     whole = np.zeros((len(PARAMETERS), len(PARAMETERS)))
     places = [PARAMETERS.index(name) for name in fit.names]
     whole[np.ix_(places, places)] = fit.covariance
-    total = np.zeros_like(whole)
-    total[np.ix_(places, places)] = fit.total_covariance(settings.gravity.sigma)
-    sigma = np.sqrt(np.diagonal(total))
+    sigma = np.zeros(len(PARAMETERS))
+    sigma[places] = fit.sigmas(settings.gravity.sigma)
     row = row | {
         "status": "ok",
         "accel_rms": float(rms[0]),

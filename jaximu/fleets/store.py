@@ -75,12 +75,10 @@ class Store:
             keys = pq.read_table(path, columns=["key"]).column("key").to_pylist()
         except (OSError, pa.ArrowException):
             keys = []  # a disk that filled up, or another program's file: these rows are computed again
-        indices = [self._place[key] for key in keys if key in self._place]
-        indices = [index for index in indices if self._owner[index] < 0]
-        if not indices:
-            return
-        self._owner[indices] = len(self._parts)
-        self._parts.append(path)
+        indices = [index for index in map(self._place.get, keys) if index is not None and self._owner[index] < 0]
+        if indices:
+            self._owner[indices] = len(self._parts)
+            self._parts.append(path)
 
     def add(self, places: Sequence[int], rows: Sequence[Json]) -> None:
         """Keep the rows of some places. Raises `InputError` where they cannot be written."""
