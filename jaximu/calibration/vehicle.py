@@ -86,9 +86,8 @@ def calibrate_at_stops(
     """
     recording, signals = stops.recording, stops.recording.signals
     accelerometer, gyroscope = recording.accelerometer, signals["gyroscope"]
-    force = (rest_statistics(accelerometer, stops.intervals)[1] - accelerometer.nominal_offset) / (
-        accelerometer.nominal_scale
-    )
+    force = rest_statistics(accelerometer, stops.intervals)[1] - accelerometer.nominal_offset
+    force = force / accelerometer.nominal_scale
     sites = _sites(stops.intervals)
     up = _mean_direction(_by_site(force, sites))
     earth, spread = _earth(up, gravity.latitude)
@@ -98,7 +97,7 @@ def calibrate_at_stops(
     felt = scale[:, None] * spread * scale  # of the Earth's rotation, the same throughout
     nominal = as_stated(recording)
     unit = replace(nominal, gyroscope=replace(nominal.triads()["gyroscope"], bias=rate.bias))
-    still = rms(rate.left + (rate.bias - gyroscope.nominal_offset) / scale)
+    bias = (rate.bias - gyroscope.nominal_offset) / scale
     calibration = Calibration(
         imu=on_host(unit),
         names=history.names,
@@ -106,7 +105,7 @@ def calibrate_at_stops(
         gravity=gravity,
         method="filter",
         loss="linear",
-        rms={"static_gyroscope": (still, rms(rate.left), "rad/s")},
+        rms={"static_gyroscope": (rms(rate.left + bias), rms(rate.left), "rad/s")},
         rank=3,
         weak=(),
         excess={"gyroscope": float(rate.excess[0])},
@@ -119,7 +118,7 @@ def calibrate_at_stops(
         reading=recording.reading,
         bias_sigma_recording={"gyroscope": np.sqrt(rate.sigma_recording**2 + np.diag(felt))},
     )
-    vehicle = _mounted(stops, sites, force, up, (rate.bias - gyroscope.nominal_offset) / scale, gravity)
+    vehicle = _mounted(stops, sites, force, up, bias, gravity)
     vehicle["bias_change"] = _entry(rate.change, rate.change_sigma, "rad/s")
     vehicle["earth_rotation"] = {"vertical_removed": gravity.latitude is not None}
     summary = {
@@ -315,11 +314,7 @@ def _mounted(
             for side, (along, left) in zip(sides, speeds @ across @ axes[:2].T, strict=True)
         ],
         "forward_share": (1 + alike) / 2 if determined else None,
-        "norm_error": _entry(
-            norm.mean() - gravity.value,
-            np.hypot(np.sqrt(scatter[0, 0]), gravity.sigma),
-            "m/s^2",
-        ),
+        "norm_error": _entry(norm.mean() - gravity.value, np.hypot(np.sqrt(scatter[0, 0]), gravity.sigma), "m/s^2"),
     }
 
 

@@ -61,7 +61,7 @@ def field_row(magnetometer: FieldUnit, fit: Fit, rms: float) -> Json:
     sigma = np.zeros(12)
     triad = fit.imu.accelerometer
     places = [3 * name.axes[0] + name.axes[1] if name.part == "gain" else 9 + name.axes[0] for name in fit.names]
-    sigma[places] = np.sqrt(np.diagonal(fit.total_covariance(factor * magnetometer.field.sigma)))
+    sigma[places] = fit.sigmas(factor * magnetometer.field.sigma)
     return {
         "mag_gain": factor * np.ravel(triad.gain),
         "mag_gain_sigma": factor * sigma[:9],
