@@ -84,7 +84,7 @@ def in_own_axes(calibration: Calibration) -> tuple[Calibration, bool]:
     if "accelerometer" not in triads or not np.triu(triads["accelerometer"].gain, 1).any():
         return calibration, False
     owners = [name for name in ("accelerometer", "gyroscope") if name in triads]
-    gains = np.stack([np.asarray(triads[name].gain) for name in owners])
+    gains = np.stack([triads[name].gain for name in owners])
 
     def turned(gains):
         change = lower_triangular_frame(gains[0], gains[1] if len(owners) > 1 else jnp.eye(3))
@@ -113,7 +113,7 @@ def epochs_of(calibrations: Sequence[Calibration], files: Sequence[str], nominal
     pairs = [in_own_axes(calibration) for calibration in calibrations]
     common = _temperatures([calibration for calibration, _ in pairs], files)
     first = pairs[0][0].triads()
-    scales = {name: (np.diagonal(triad.gain), np.asarray(triad.bias)) for name, triad in first.items()} | dict(nominal)
+    scales = {name: (np.diagonal(triad.gain), triad.bias) for name, triad in first.items()} | dict(nominal)
     return [
         _epoch(*_at_temperatures(calibration, common), file, turned, scales)
         for (calibration, turned), file in zip(pairs, files, strict=True)
@@ -195,7 +195,7 @@ def _at_temperatures(calibration: Calibration, common: Mapping[str, float]) -> t
                 if number in calibration.names and bias in calibration.names:
                     index = calibration.names.index(bias), calibration.names.index(number)
                     shift[index] = (slope - origin)[axis, column]
-        changed = replace(triad, bias=np.asarray(triad.bias) + there - here, temperature_reference=celsius)
+        changed = replace(triad, bias=triad.bias + there - here, temperature_reference=celsius)
         calibration = replace(
             calibration,
             imu=replace(calibration.imu, **{owner: changed}),

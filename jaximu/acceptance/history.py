@@ -300,14 +300,9 @@ def _comparable(epochs: Sequence[Epoch]) -> tuple[list[str], list[str]]:
         elif all(text == "fixed" for text in unless):
             continue  # by convention, or of a data sheet
         elif any(unless):
-            texts = [
-                f"{epoch.file} holds a data sheet's value or zero"
-                for epoch, t in zip(epochs, unless, strict=True)
-                if t == "fixed"
-            ]
-            left_out[stem if stem in CATALOGUE else name] = (
-                texts + [text for text in unless if text and text != "fixed"]
-            )[0]
+            fixed = [epoch.file for epoch, text in zip(epochs, unless, strict=True) if text == "fixed"]
+            why = f"{fixed[0]} holds a data sheet's value or zero" if fixed else next(filter(None, unless))
+            left_out[stem if stem in CATALOGUE else name] = why
         elif _kind(name) in apart:
             left_out[name] = apart[_kind(name)]
         elif stem in CATALOGUE and _has_axes(CATALOGUE[stem]) and any(epoch.turned for epoch in epochs):
@@ -481,11 +476,10 @@ def _output(first: Epoch, last: Epoch, owner: str, over: float) -> OutputChange:
         return error(*flats), jax.jacfwd(error, (0, 1))(*flats)
 
     values, slopes = stored.call(both, f"compare {owner}", [flatten(model) for model in models], models, stimulus)
-    values = np.asarray(values)
     spread, common = np.zeros((len(values), 3, 3)), []
     for epoch, slope in zip((first, last), slopes, strict=True):
         every = names_of(epoch.calibration.imu)
-        free = np.asarray(slope)[..., [every.index(name) for name in epoch.calibration.names]]
+        free = slope[..., [every.index(name) for name in epoch.calibration.names]]
         spread += np.einsum("nip,pq,njq->nij", free, epoch.covariance, free)
         common.append(free @ epoch.by_gravity)
     for shift in [common[0] + common[1]] if first.gravity == last.gravity else common:
