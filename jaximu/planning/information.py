@@ -27,6 +27,7 @@ from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.rotation import IDENTITY, UP, conjugate, exponential, logarithm, multiply, rotation_matrix
 from jaximu.ground.stored import compiled
+from jaximu.ground.vectors import root_or_zero
 from jaximu.model.mounting import Mounting
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
@@ -103,8 +104,7 @@ def _plain(imu: Imu) -> Imu:
 
 def _observed(imu: Imu, attitude, accuracy: Accuracy, gravity) -> Observations:
     """What a unit would put out, without noise, held in attitudes and turned from each to the next."""
-    count = attitude.shape[0]
-    vectors = turn_vectors(attitude)
+    count, vectors = len(attitude), turn_vectors(attitude)
     steps = len(vectors), SAMPLES
     middle = (jnp.arange(SAMPLES) + 0.5) / SAMPLES
     during = multiply(
@@ -149,7 +149,7 @@ def _information(covariance, jacobian):
 def root_of(covariance: FloatArray) -> FloatArray:
     """Return a root R (..., n, n), R Rᵀ = C, of covariances or of information; what rounding makes negative is zero."""
     values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+    return vectors * root_or_zero(values)[..., None, :]
 
 
 def gravity_sensitivity(imu: Imu, names: Sequence[Name], gravity: LocalGravity) -> FloatArray:

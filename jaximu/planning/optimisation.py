@@ -211,8 +211,8 @@ def optimise(
     question: DesignQuestion,
     starts: Sequence[Design],
     fastest: float,
-    report: Callable[[str], None] = lambda _: None,
-    steps: tuple[int, int] = STEPS,
+    report: Callable[[str], None],
+    steps: tuple[int, int],
 ) -> Design:
     """Return the best design that is reached from the starts.
 

@@ -20,7 +20,7 @@ from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import UP
-from jaximu.ground.tracing import on_host
+from jaximu.ground.tracing import on_host, part_of
 from jaximu.ground.vectors import dot_rows, sigmas_of, submatrix
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
@@ -146,23 +146,20 @@ class Known:
         if observations is None:
             return replace(known, excess=_left_over(calibration))
         poses, turns = observations.poses, observations.turns
-        real, turned = np.asarray(poses.mask), np.asarray(turns.mask)
-        rest = (np.asarray(poses.stop) - np.asarray(poses.start))[real]
-        means = [
-            np.asarray(covariance)[real] for covariance in (poses.accelerometer_covariance, poses.gyroscope_covariance)
-        ]
-        density = np.mean(means[0] * rest[:, None, None], axis=0)
+        poses, noise = part_of(poses, np.asarray(poses.mask)), np.asarray(turns.noise)
+        turned = np.asarray(turns.interval)[np.asarray(turns.mask)]
+        density = np.mean(poses.accelerometer_covariance * (poses.stop - poses.start)[:, None, None], axis=0)
         # variances as traces: the next rests and turns have other durations, their excess is the same
         excess = calibration.excess
-        duration = float(np.sum(np.asarray(turns.interval)[turned], axis=1).mean()) if turned.any() else 0.0
+        duration = float(np.sum(turned, axis=1).mean()) if len(turned) else 0.0
         return replace(
             known,
             accelerometer_noise=density,
-            gyroscope_noise=np.asarray(turns.noise) if "turns" in excess else None,
+            gyroscope_noise=noise if "turns" in excess else None,
             excess=(
-                excess["accelerometer"] * float(np.trace(means[0].mean(axis=0))),
-                excess.get("turns", 0.0) * duration * float(np.trace(np.asarray(turns.noise))),
-                excess.get("gyroscope", 0.0) * float(np.trace(means[1].mean(axis=0))),
+                excess["accelerometer"] * float(np.trace(poses.accelerometer_covariance.mean(axis=0))),
+                excess.get("turns", 0.0) * duration * float(np.trace(noise)),
+                excess.get("gyroscope", 0.0) * float(np.trace(poses.gyroscope_covariance.mean(axis=0))),
             ),
         )
 
@@ -170,10 +167,11 @@ class Known:
     def from_specification(cls, specification: Specification) -> Known:
         """Return the first unit of a specification as its data sheet, with its white noise; nothing calibrated yet."""
         case = specification.case(0)
+        squares = {name: noise_squares(case, name).get("N") for name in case.imu.triads()}
         noise = {
-            name: _in_output(triad, np.diag(noise_squares(case, name)["N"]))
+            name: _in_output(triad, np.diag(squares[name]))
             for name, triad in case.imu.triads().items()
-            if "N" in noise_squares(case, name)
+            if squares[name] is not None
         }
         gravity = LocalGravity(float(case.plan.motion.gravity), 0.0)
         return cls(
@@ -359,7 +357,7 @@ def propose(
     exact, design, best, classical = _searched(question, poses, turns, equipment, seed, report)
     if classical:
         notes += ("well known positions do as well as any here, and are proposed.",)
-    names, size = question.parameters.names, np.asarray(question.parameters.size)
+    names, size = question.parameters.names, question.parameters.size
     prior = np.linalg.inv(question.prior) + np.outer(question.by_gravity, question.by_gravity)
     # what the data sheet adds is none of the data's: it must not hide a direction that no pose tells
     root = root_of(best.information + question.prior - np.eye(len(size)) / TOLERANCE**2)
@@ -375,7 +373,7 @@ def propose(
         question.imu,
         names,
         (size[:, None] * prior * size, size[:, None] * best.covariance * size),
-        size * np.asarray(question.by_gravity),
+        size * question.by_gravity,
         *criteria,
         rank=rank,
         open=weak,
@@ -425,9 +423,8 @@ def question_of(
         return not equipment.chained or without_equipment(name)
 
     parameters = Parameters.select(imu, keep)
-    names, size = parameters.names, np.asarray(parameters.size)
-    criterion, weights = criterion_of(criterion, parameter, names)
-    by_gravity = gravity_sensitivity(imu, names, known.gravity) / size
+    criterion, weights = criterion_of(criterion, parameter, parameters.names)
+    by_gravity = gravity_sensitivity(imu, parameters.names, known.gravity) / parameters.size
     if known.covariance is not None and not equipment.chained and _is_by_hand(known.names):
         notes += (
             "a calibration by hand has the accelerometer's axes for its frame; how they lie to the table's is "
@@ -479,8 +476,7 @@ def _plannable(imu: Imu) -> tuple[Imu, tuple[str, ...]]:
 
 
 def _in_output(triad: Triad, density: FloatArray) -> FloatArray:
-    gain = np.asarray(triad.gain)
-    return gain @ density @ gain.T
+    return triad.gain @ density @ triad.gain.T
 
 
 def _accuracy(known: Known, imu: Imu, equipment: Equipment) -> tuple[Accuracy, tuple[str, ...]]:
@@ -509,7 +505,7 @@ def _accuracy(known: Known, imu: Imu, equipment: Equipment) -> tuple[Accuracy, t
 
 def _prior(known: Known, imu: Imu, parameters: Parameters, by_gravity: FloatArray) -> FloatArray:
     """Information (typical sizes) about the parameters, gravity known: the calibration's, else the data sheet's."""
-    names, size = parameters.names, np.asarray(parameters.size)
+    names, size = parameters.names, parameters.size
     total = TOLERANCE**2 * np.eye(len(names))
     if known.covariance is not None:
         upper, by_hand = [index for index, name in enumerate(names) if name in _UPPER], _is_by_hand(known.names)
@@ -548,7 +544,7 @@ def _frame(imu: Imu, names: Sequence[Name]) -> FloatArray:
     for index, name in enumerate(names):
         if name.part == "gain":
             row, column = name.axes
-            change[index] = np.einsum("j,kj->k", np.asarray(imu.triads()[name.owner].gain)[row], _CROSS[:, :, column])
+            change[index] = _CROSS[:, :, column] @ imu.triads()[name.owner].gain[row]
     return change
 
 
@@ -586,7 +582,7 @@ def _starts(poses: int, turns: int, equipment: Equipment, seed: int) -> list[Des
 
     def spread(count: int) -> FloatArray:
         even = spiral(count)
-        up = np.asarray(rng.permutation(Rotation.random(None, rng).apply(even)) if count else even, float)
+        up = rng.permutation(Rotation.random(None, rng).apply(even)) if count else even
         if equipment.z_up:
             up[:, 2] = np.abs(up[:, 2])
         return up
@@ -616,7 +612,7 @@ def _ordered(design: Design, equipment: Equipment) -> Design:
 
 def _attitudes(up: FloatArray, heading: FloatArray | float = 0.0) -> FloatArray:
     """Attitudes (n, 4) with these upward directions (n, 3); there may be none."""
-    return np.asarray(attitude_of(up, heading).as_quat(scalar_first=True)) if len(up) else np.zeros((0, 4))
+    return attitude_of(up, heading).as_quat(scalar_first=True) if len(up) else np.zeros((0, 4))
 
 
 def _neighbourly(attitudes: FloatArray) -> FloatArray:
@@ -626,27 +622,23 @@ def _neighbourly(attitudes: FloatArray) -> FloatArray:
 
 
 def _rounded(design: Design, equipment: Equipment) -> Design:
-    step, attitude = np.radians(equipment.step), np.asarray(design.attitude)
-    if equipment.robot:
-        round_ = np.array([round_attitude(quaternion, step) for quaternion in attitude])
+    step, attitude = np.radians(equipment.step), design.attitude
+    if equipment.chained:
+        zero = first_heading(attitude[0]) if equipment.by_hand else 0.0
+        round_ = np.array([round_attitude(quaternion, step, zero) for quaternion in attitude])
+        if equipment.by_hand:
+            return replace(design, attitude=_neighbourly(round_))
         signs = np.where(dot_rows(round_, attitude) >= 0, 1.0, -1.0)
         return replace(design, attitude=round_ * signs[:, None])  # each turn goes the way that was sought
-    if equipment.by_hand:
-        zero = first_heading(attitude[0])
-        return replace(
-            design, attitude=_neighbourly(np.array([round_attitude(quaternion, step, zero) for quaternion in attitude]))
-        )
     up, axis = (
-        _attitudes(np.array([round_direction(direction, step) for direction in up_of(np.asarray(part))]))
+        _attitudes(np.array([round_direction(direction, step) for direction in up_of(part)]))
         for part in (attitude, design.axis)
     )
     return Design(up, axis, np.radians(np.round(np.degrees(design.rate), 0)))
 
 
 def _poses(design: Design, equipment: Equipment) -> tuple[Pose, ...]:
-    return tuple(
-        Pose(up_of(attitude), attitude, _words(attitude, equipment)) for attitude in np.asarray(design.attitude)
-    )
+    return tuple(Pose(up_of(attitude), attitude, _words(attitude, equipment)) for attitude in design.attitude)
 
 
 def _words(attitude: FloatArray, equipment: Equipment) -> str:
@@ -659,7 +651,6 @@ def _words(attitude: FloatArray, equipment: Equipment) -> str:
 
 def _turns(design: Design, equipment: Equipment) -> tuple[Turn, ...]:
     if not equipment.chained:
-        rates = np.asarray(design.rate)
         return tuple(
             Turn(
                 up,
@@ -669,7 +660,7 @@ def _turns(design: Design, equipment: Equipment) -> tuple[Turn, ...]:
                 f"({abs(np.degrees(rate)) * equipment.turn:.4g}°), {'anticlockwise' if rate > 0 else 'clockwise'} "
                 "seen from above",
             )
-            for up, rate in zip(up_of(np.asarray(design.axis)), rates, strict=True)
+            for up, rate in zip(up_of(design.axis), design.rate, strict=True)
         )
     turns = []
     for vector in np.asarray(turn_vectors(design.attitude)):

@@ -30,7 +30,7 @@ def _polar(up: FloatArray) -> tuple[int, float, float, float]:
     """The axis nearest to "up", its sign, the angle to it and the direction in which "up" leaves it (rad)."""
     axis = int(np.argmax(np.abs(up) + [0, 1e-9, 2e-9]))  # halfway between two, rounding must not decide
     sign = 1.0 if up[axis] > 0 else -1.0
-    j, k = up[(axis + 1) % 3], up[(axis + 2) % 3]
+    _, j, k = np.roll(up, -axis)
     return axis, sign, float(np.arctan2(np.hypot(j, k), abs(up[axis]))), float(np.arctan2(k, j))
 
 
@@ -39,12 +39,8 @@ def round_direction(up: FloatArray, step: float) -> FloatArray:
     axis, sign, tilt, azimuth = _polar(up)
     tilt, azimuth = (round(angle / step) * step for angle in (tilt, azimuth))
     while True:
-        rounded = np.zeros(3)
-        rounded[axis] = sign * np.cos(tilt)
-        rounded[(axis + 1) % 3], rounded[(axis + 2) % 3] = (
-            np.sin(tilt) * np.cos(azimuth),
-            np.sin(tilt) * np.sin(azimuth),
-        )
+        across = np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth)
+        rounded = np.roll([sign * np.cos(tilt), *across], axis)
         rounded = np.where(np.abs(rounded) < 1e-12, 0.0, rounded)
         if _polar(rounded)[0] == axis:
             return rounded
