@@ -358,7 +358,7 @@ def ellipsoid(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
     x, y, z = ((values - centre) / size).T
     design = np.stack([x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z, 2 * x, 2 * y, 2 * z], axis=1)
     p = np.linalg.lstsq(design, np.ones(len(design)), rcond=None)[0]
-    shape = np.array([[p[0], p[3], p[4]], [p[3], p[1], p[5]], [p[4], p[5], p[2]]])
+    shape = p[np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])]
     if np.linalg.cond(shape) > 1e6:
         return None
     middle = -np.linalg.solve(shape, p[6:])
@@ -383,7 +383,7 @@ def _start(
     scale, centre, field, notes = field_start(windows.output, signal.unit, strength, logs[0].name, carried)
     turn = _axes(windows, centre, southern)
     if not np.array_equal(turn, np.eye(3)):
-        names = [("+" if sum(row) > 0 else "−") + "xyz"[int(np.flatnonzero(row)[0])] for row in turn]
+        names = [("+" if sum(row) > 0 else "−") + _longest(row) for row in turn]
         notes.append(
             f"the magnetometer's x, y and z lie along the unit's {', '.join(names)}: the gain says so, and nothing has "
             "to be turned."
@@ -474,9 +474,7 @@ def _axes(windows: FieldWindows, centre: FloatArray, southern: bool | None) -> F
     """
     if windows.alone:
         return np.eye(3)
-    field = windows.output - centre
-    calm = windows.calm
-    costs = []
+    field, calm, costs = windows.output - centre, windows.calm, []
     for turn in ARRANGEMENTS:
         body = field @ turn  # turnᵀ applied to every row
         length = lengths_of(body)
@@ -594,15 +592,10 @@ def _disturbed(imu: Imu, windows: FieldWindows, whole: FieldWindows) -> BoolArra
     What is next to such a window is asked at a lower level, and what lies between two is one, too: a disturbance that
     turns past the field changes for a moment neither.
     """
-    field = whole.field(imu)
+    field, noise, size = whole.field(imu), _white(imu, whole), np.zeros(len(whole))
     length = lengths_of(field)
-    noise = _white(imu, whole)
     dip = dot_rows(whole.up, field) / length
-    size = np.zeros(len(whole))
-    for values, known, least in (
-        (length, whole.used, noise),
-        (dip, whole.calm, noise / np.median(length)),
-    ):
+    for values, known, least in ((length, whole.used, noise), (dip, whole.calm, noise / np.median(length))):
         usual = known & windows.used
         if usual.any():
             off = np.where(known, np.abs(values - np.median(values[usual])), 0.0)
@@ -618,7 +611,7 @@ def _refuse_changed(fit: Fit, windows: FieldWindows, field: FieldStrength, where
     if not np.isfinite(strength).all() or len(strength) < 4 * least:
         return
     count, total = np.arange(1, len(strength)), np.cumsum(strength)
-    rest = len(strength) - count
+    rest = count[::-1]
     before, after = total[:-1] / count, (total[-1] - total[:-1]) / rest
     gain = (count * rest * (after - before) ** 2)[least - 1 : 1 - least]
     last = int(np.argmax(gain)) + least - 1
@@ -763,11 +756,11 @@ def _dip(windows: FieldWindows, fit: Fit) -> tuple[float | None, float]:
         return None, 0.0
     field = windows.field(fit.imu)
     sine = -dot_rows(windows.up, field)[calm] / lengths_of(field)[calm]
-    dip = float(np.arcsin(np.clip(np.median(sine), -1, 1)))
-    spread = robust_sigma(sine - np.median(sine)) / max(np.cos(dip), 0.05)
+    middle = np.median(sine)
+    dip = float(np.arcsin(np.clip(middle, -1, 1)))
+    spread = robust_sigma(sine - middle) / np.sqrt(max(calm.sum() / 4, 1))  # neighbours share their errors
     bent = windows.bent(field)[calm].mean(axis=0)
-    common = np.sqrt(bent @ windows.vertical @ bent) / max(np.cos(dip), 0.05)
-    return dip, float(np.hypot(spread / np.sqrt(max(calm.sum() / 4, 1)), common))  # neighbours share their errors
+    return dip, float(np.hypot(spread, np.sqrt(bent @ windows.vertical @ bent)) / max(np.cos(dip), 0.05))
 
 
 def heading_errors(calibration: Calibration, start: Imu, strength: float, dip: float) -> Heading:
@@ -783,7 +776,7 @@ def heading_errors(calibration: Calibration, start: Imu, strength: float, dip: f
     attitude = scipy.spatial.transform.Rotation.from_euler("ZYX", angles, degrees=True)
     known = calibration.of_numbers(_of_iron)
     body, slope = _heading_slopes(known.names, triad, attitude, strength, dip)
-    sigma = root_or_zero(np.einsum("ni,ij,nj->n", slope, known.covariance, slope))
+    sigma = root_or_zero(dot_rows(slope @ known.covariance, slope))
     level = attitude.apply(np.linalg.solve(before.gain, (body @ triad.gain.T + triad.bias).T).T)
     off = np.abs(np.arctan2(level[:, 0], level[:, 1]))
     scatter = np.sqrt(calibration.excess.get(EXCESS_NAMES[0], 0.0)) * 0.1 / (strength * np.cos(dip))
@@ -834,7 +827,7 @@ def next_directions(calibration: Calibration, measurement: MagneticField, dip: f
     reaction = np.einsum("ni,nik->nk", grid, _reactions(known.names, measurement.strength * grid, triad.gain)) / sigma
 
     def accuracy() -> float:
-        return float(np.degrees(np.sqrt(np.mean(np.einsum("np,pq,nq->n", heading, spread, heading)))))
+        return float(np.degrees(np.sqrt(np.mean(dot_rows(heading @ spread, heading)))))
 
     before, chosen = accuracy(), []
     for _ in range(count):
@@ -858,7 +851,7 @@ def field_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, m
         return "half a minute at rest, for the gyroscope's bias."
     change, shift = inverse @ change, inverse @ shift / _TYPICAL
     grid = spiral(200)
-    strength = np.abs(np.einsum("ni,ij,nj->n", grid, change, grid) + grid @ shift)
+    strength = np.abs(dot_rows(grid @ change, grid) + grid @ shift)
     turn = 0.5 * (change[[2, 0, 1], [1, 2, 0]] - change[[1, 2, 0], [2, 0, 1]])
     if np.linalg.norm(turn) > 1.5 * strength.max():  # up · (turn × field) is largest where the turn's axis points east
         return f"rests in which the unit's {_longest(turn)} axis lies level and points east, and rests with it west."
@@ -881,11 +874,8 @@ def _gyroscope_bias(calibration: Calibration) -> Json | None:
     if not any(name.owner == "gyroscope" for name in calibration.names):
         return None
     triad = calibration.imu.triads()["gyroscope"]
-    return {
-        "value": triad.bias.tolist(),
-        "sigma": calibration.sigma("gyroscope")[1].tolist(),
-        "unit": triad.output_unit,
-    }
+    sigma = calibration.sigma("gyroscope")[1]
+    return {"value": triad.bias.tolist(), "sigma": sigma.tolist(), "unit": triad.output_unit}
 
 
 def _with_base(calibration: Calibration, base: Calibration | None) -> Calibration:
