@@ -46,6 +46,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import rotate
+from jaximu.ground.vectors import sigmas_of
 from jaximu.mistakes import Prepared, prepared
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.effects.magnetic_field import SetupMagneticField
@@ -327,12 +328,12 @@ class FilterInUse:
         if lost_track or (measured and not arrival):
             self._moving, self._unseen = 0.0, 0.0
         arrival = arrival and not lost_track
-        missing = self._padded - len(time)
+        rows = np.minimum(np.arange(self._padded), len(time) - 1)
         part = MotionIntervals(
-            np.pad(force, [(0, missing), (0, 0)], "edge"),
-            np.pad(rate, [(0, missing), (0, 0)], "edge"),
-            np.pad(step, (0, missing)),
-            np.pad(time, (0, missing), "edge"),
+            force[rows],
+            rate[rows],
+            np.pad(step, (0, self._padded - len(time))),
+            time[rows],
             np.float64(rest),
             np.float64(arrival),
             np.float64(lost_track),
@@ -369,20 +370,9 @@ class FilterInUse:
         freedom = 6 * rest + 3 * arrival + 3 * sum(int(sighting.measured > 0) for sighting in sightings)
         if freedom:
             self._recent.append((innovation, freedom))
-        sigmas = np.sqrt(np.diagonal(covariance)[states:-1])
-        return [
-            FilterState(
-                end,
-                rest,
-                self._numbers[self._index],
-                sigmas,
-                innovation,
-                freedom,
-                attitude,
-                drift,
-                np.sqrt(np.diagonal(spread)),
-            )
-        ]
+        sigmas = sigmas_of(covariance)[states:-1]
+        numbers = self._numbers[self._index]
+        return [FilterState(end, rest, numbers, sigmas, innovation, freedom, attitude, drift, sigmas_of(spread))]
 
     @property
     def change(self) -> FloatArray:
