@@ -147,7 +147,7 @@ class _Turned:
 
     def without(self, turns: IntArray) -> _Turned:
         """Return the same with some turns, by place, free."""
-        free = np.ravel(2 * turns[:, None] + np.arange(2))
+        free = np.add.outer(2 * turns, np.arange(2)).ravel()
         size = np.sqrt(_FREE)
         return self.beside(size * self.gram[:, free], _FREE * submatrix(self.gram, free), size * self.pull[free])
 
@@ -162,13 +162,9 @@ class _Turned:
             whole = _diagonal(covariance)
             inner = np.eye(len(self.pull)) + self.gram @ whole
             evidence[k, m] = (self.pull @ whole @ np.linalg.solve(inner, self.pull) - np.linalg.slogdet(inner)[1]) / 2
-        beforehand = (
-            -(
-                np.square(np.log(_SCATTER / _USUAL_SCATTER) / _SCATTER_SPREAD)[:, None]
-                + np.square(np.log(np.maximum(_SAMPLING, 0.02) / _USUAL_SAMPLING) / _SAMPLING_SPREAD)
-            )
-            / 2
-        )
+        scatter = np.square(np.log(_SCATTER / _USUAL_SCATTER) / _SCATTER_SPREAD)
+        sampling = np.square(np.log(np.maximum(_SAMPLING, 0.02) / _USUAL_SAMPLING) / _SAMPLING_SPREAD)
+        beforehand = -np.add.outer(scatter, sampling) / 2
         evidence += beforehand - np.logaddexp.reduce(beforehand, axis=None)
         likeliest = int(np.argmax(evidence)) // len(_SAMPLING)
         return self.constant + float(np.logaddexp.reduce(evidence, axis=None)), float(_SCATTER[likeliest] ** 2)
@@ -186,11 +182,8 @@ class _Recorded:
     """A calibration's recordings, its turns' conditions, and the samples of each turn."""
 
     def __init__(self, calibration: Calibration) -> None:
-        fitted, observations, gyroscope = (
-            calibration.fit,
-            calibration.observations,
-            calibration.imu.triads()["gyroscope"],
-        )
+        fitted, observations = calibration.fit, calibration.observations
+        gyroscope = calibration.imu.triads()["gyroscope"]
         assert fitted is not None and observations is not None
         self.calibration, self.observations, self.gyroscope = calibration, observations, gyroscope
         self.signals = [part.recording.signals["gyroscope"] for part in calibration.segmentations]
@@ -287,8 +280,8 @@ class _Recorded:
         middle = midpoints(rate)
         speed = np.maximum(lengths_of(middle), 1e-9)
         axis = middle / speed[:, None]
-        along = dot_rows(wanted - carried, axis)
-        left = np.abs(along) / np.maximum(lengths_of(wanted - carried), 1e-12)
+        moved = wanted - carried
+        left = np.abs(dot_rows(moved, axis)) / np.maximum(lengths_of(moved), 1e-12)
         carried, wanted = (
             gravity - axis * np.sum(gravity * axis, axis=1, keepdims=True) for gravity in (carried, wanted)
         )
