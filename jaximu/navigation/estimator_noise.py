@@ -43,6 +43,7 @@ from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import number
 from jaximu.ground.stored import compiled
+from jaximu.ground.tracing import on_host
 from jaximu.ground.units import INERTIAL_QUANTITIES
 from jaximu.ground.vectors import lengths_of, submatrix
 from jaximu.model import BiasInstability
@@ -189,7 +190,7 @@ class MeasuredErrors:
         fitted, measurement = calibrate_against_attitude(recording, attitude, gravity, unit=unit)
         data, known = measurement.intervals, measurement.attitude
         mounting = Mounting.of(fitted.imu)
-        middle = (np.asarray(data.since) + np.asarray(data.until)) / 2
+        middle = (data.since + data.until) / 2
         beside = measurement.around(fitted.imu).beside_motion()
         force, rate = compiled(Imu.recover)(replace(fitted.imu, setup=()), data.force, data.rate, beside)
         tilt = scipy.spatial.transform.Rotation.from_rotvec(np.append(mounting.tilt, 0.0))
@@ -215,8 +216,8 @@ class MeasuredErrors:
         return cls(
             np.asarray(rate),
             np.asarray(force),
-            np.asarray(data.since),
-            np.asarray(data.until),
+            data.since,
+            data.until,
             stamp,
             whole.as_quat(scalar_first=True),
             velocity,
@@ -244,18 +245,16 @@ class MeasuredErrors:
         step = max(1, round(length / period))
         first = inside[: max(0, len(inside) - step) : step]
         last = first + step
-        whole = (self.stamp[last] - self.stamp[first] < (step + 1.5) * period) & _without_gaps(
-            self.since, self.until, self.stamp[first], self.stamp[last]
-        )
-        kept = _spread(np.flatnonzero(whole & self.steady[first] & self.steady[last]))
-        first, last = first[kept], last[kept]
         start, stop = self.stamp[first], self.stamp[last]
+        whole = (stop - start < (step + 1.5) * period) & _without_gaps(self.since, self.until, start, stop)
+        kept = _spread(np.flatnonzero(whole & self.steady[first] & self.steady[last]))
+        first, last, start, stop = (ends[kept] for ends in (first, last, start, stop))
         begin = np.searchsorted(self.until, start, "right")
         size = max(1, int((np.searchsorted(self.since, stop) - begin).max(initial=1)))
-        rows = np.minimum(begin[:, None] + np.arange(size), len(self.until) - 1)
-        inner = begin[:, None] + np.arange(size) < len(self.until)
+        places = begin[:, None] + np.arange(size)
+        rows = np.minimum(places, len(self.until) - 1)
         held = np.minimum(self.until[rows], stop[:, None]) - np.maximum(self.since[rows], start[:, None])
-        held = np.maximum(held, 0.0) * inner
+        held = np.maximum(held, 0.0) * (places == rows)
         rates, forces = self.rates[rows], self.forces[rows]
         errors, velocity_errors = self._errors(rates, forces, held, first, last)
         return Stretches(rates, forces, held, start - self.since[0], rows, errors, velocity_errors)
@@ -287,8 +286,7 @@ class MeasuredErrors:
 
 def steady_stamps(stamp: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> BoolArray:
     """Whether a reference's velocity (T, 3) changes at each stamp (T,) about as the unit's acceleration (T, 3) says."""
-    mean = midpoints(acceleration)
-    off = lengths_of(np.diff(velocity, axis=0) / np.diff(stamp)[:, None] - mean)
+    off = lengths_of(np.diff(velocity, axis=0) / np.diff(stamp)[:, None] - midpoints(acceleration))
     leap = off > _LEAP * np.median(off)
     near = np.convolve(leap, np.ones(4), "full") > 0  # a difference of positions reaches two stamps
     return ~np.concatenate([near, [False]])[1 : len(stamp) + 1]
@@ -481,11 +479,7 @@ def estimator_noise(
     final = {triad: float(triad_noise.applied[chosen]) for triad, triad_noise in triads.items()}
     stated = dict.fromkeys(final, 1.0)
     rows = [[_nees(parts[length], multipliers, walks[interval]) for multipliers in (stated, final)] for length in kept]
-    nees = {
-        name: np.array([[increments[name] for increments in pair] for pair in rows])
-        for name in _ROWS
-        if all(name in increments for pair in rows for increments in pair)
-    }
+    nees = {name: np.array([[increments[name] for increments in pair] for pair in rows]) for name in rows[0][0]}
     return EstimatorNoise(
         np.array(kept),
         chosen,
@@ -504,16 +498,14 @@ def nees(
     noise: SensorNoise,
     length: float,
     multipliers: Mapping[str, float],
-    interval: float | None = None,
 ) -> dict[str, float]:
     """Return the mean NEES of ΔR, Δv and Δp over stretches of one length, each over its three degrees of freedom.
 
-    **Arguments:** as of [`estimator_noise`]; `multipliers`: of N by triad, such as those that another motion gave;
-    `interval`: for which B becomes a walk, `length` if None. Raises `NotPossibleError` where the motion is too short.
+    **Arguments:** as of [`estimator_noise`]; `length`: s, for which B becomes a walk, too; `multipliers`: of N by
+    triad, such as those that another motion gave. Raises `NotPossibleError` where the motion is too short.
     """
     part = _part(source, noise, length)
-    at = part if interval is None else _part(source, noise, interval)
-    return _nees(part, multipliers, {triad: _walk(at, triad) for triad in INERTIAL_QUANTITIES})
+    return _nees(part, multipliers, {triad: _walk(part, triad) for triad in INERTIAL_QUANTITIES})
 
 
 class _Length(NamedTuple):
@@ -558,9 +550,8 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
         jitter = source.trajectory.jitter
         stamps = _stamp_errors(stretches) * jitter if jitter else None
     samples = (stretches.rates, stretches.forces, stretches.held)
-    white, walk, drift, moved, pushed = _covariances(samples, interval, flicker, slopes, stamps)
-    white, walk = np.asarray(white), np.asarray(walk)
-    spread = {(triad, "B"): np.asarray(covariance_of_drift) for triad, covariance_of_drift in drift.items()}
+    white, walk, drift, moved, pushed = on_host(_covariances(samples, interval, flicker, slopes, stamps))
+    spread = {(triad, "B"): covariance_of_drift for triad, covariance_of_drift in drift.items()}
     for triad, columns in _COLUMNS.items():
         sizes = noise[triad]
         spread[triad, "N"] = np.einsum("njik,j->nik", white[:, columns], np.square(sizes["N"]))
@@ -572,7 +563,6 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
     block = (stretches.start / longest).astype(int)
     if not modelled:
         return _measured_part(stretches, spread, block)
-    moved, pushed = np.asarray(moved), None if pushed is None else np.asarray(pushed)
     power = source.trajectory.excess_power({triad: noise[triad]["N"] for triad in INERTIAL_QUANTITIES})
     whole = 0.0 if pushed is None else pushed
     moment: dict[str, FloatArray | None] = {}
