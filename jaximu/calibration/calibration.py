@@ -31,7 +31,7 @@ from jaximu.ground.quantities import listed, unit_text
 from jaximu.ground.reexport import later
 from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.tracing import on_host
-from jaximu.ground.units import SENSOR_UNITS
+from jaximu.ground.units import SENSOR_QUANTITIES, SENSOR_UNITS
 from jaximu.ground.vectors import sigmas_of, submatrix
 from jaximu.model.effects.base import Effect
 from jaximu.model.sensor import Imu, Triad
@@ -488,7 +488,8 @@ def _from_document(document: Json) -> Calibration:
             effects.append(kind.make(_numbers(entry["coefficients"], (kind.size,)), **inner))
         return tuple(effects)
 
-    def triad(part: Json, quantity: str) -> Triad:
+    def triad(name: str) -> Triad:
+        part: Json = document[name]
         gain = _numbers(part["gain"], (3, 3))
         if abs(np.linalg.det(unit_vectors(gain))) < 1e-6:
             raise ValueError("the gain is singular")
@@ -497,27 +498,26 @@ def _from_document(document: Json) -> Calibration:
             gain,
             _numbers(part["bias"], (3,)),
             effects,
-            quantity,
+            SENSOR_QUANTITIES[name],
             str(part["output_unit"]),
             temperature_reference=float(part["temperature_reference"]),
             time_reference=float(part["time_reference"]),
         )
 
-    sensors = ("accelerometer", "gyroscope", "magnetometer")
-    accelerometer, gyroscope, magnetometer = (document.get(name) for name in sensors)
-    if accelerometer is None and gyroscope is None and magnetometer is None:
+    triads = {name: triad(name) for name in SENSOR_QUANTITIES if document.get(name) is not None}
+    if not triads:
         raise KeyError("accelerometer")
     fit, gravity = document["fit"], document["setup"]["gravity"]
     imu = Imu(
-        Imu.nominal().accelerometer if accelerometer is None else triad(accelerometer, "specific_force"),
-        None if gyroscope is None else triad(gyroscope, "angular_rate"),
+        triads.get("accelerometer", Imu.nominal().accelerometer),
+        triads.get("gyroscope"),
         effects_of(document["setup"].get("effects", {})),
-        None if magnetometer is None else triad(magnetometer, "magnetic_field"),
+        triads.get("magnetometer"),
     )
     known = {str(name): name for name in names_of(imu)}
     names = tuple(known[name] for name in document["covariance"]["parameters"])
     covariance = _numbers(document["covariance"]["matrix"], (len(names), len(names)))
-    sigmas = dict(zip(names, np.sqrt(np.diagonal(covariance)), strict=True))
+    sigmas = dict(zip(names, sigmas_of(covariance), strict=True))
 
     def recorded(name: str) -> FloatArray:
         entries = enumerate(document[name]["bias_sigma_recording"])
@@ -551,14 +551,12 @@ def _from_document(document: Json) -> Calibration:
         trace=document.get("trace"),
         digest=document.get("digest"),
         filter=document.get("filter"),
-        absent=("accelerometer",) if accelerometer is None else (),
+        absent=() if "accelerometer" in triads else ("accelerometer",),
         reading=None if document.get("reading") is None else Reading.from_document(document["reading"]),
-        bias_sigma_recording={
-            name: recorded(name) for name in sensors if "bias_sigma_recording" in (document.get(name) or {})
-        },
-        magnetic=None
-        if magnetometer is None
-        else {key: document.get(key) if key == "next" else document[key] for key in MAGNETIC},
+        bias_sigma_recording={name: recorded(name) for name in triads if "bias_sigma_recording" in document[name]},
+        magnetic={key: document.get(key) if key == "next" else document[key] for key in MAGNETIC}
+        if "magnetometer" in triads
+        else None,
     )
 
 

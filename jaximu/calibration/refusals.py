@@ -14,6 +14,7 @@ from jaximu.estimation.uncertainty import UNDETERMINED
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.quantities import Z95, number, sentence
+from jaximu.ground.vectors import submatrix
 
 _LOST = 45.0
 """Degrees, rms, by which a gyroscope that turned with the accelerometer cannot lose gravity over turns."""
@@ -27,7 +28,7 @@ def require_determined(
     **Arguments:** `shown`, `record`: what was seen and what to record, for the message; or `poses`, by hand. `prior`:
     what is known of effects beforehand.
     """
-    if bool(fitted.finite):  # along directions left open a fit may creep until its steps run out
+    if fitted.finite:  # along directions left open a fit may creep until its steps run out
         if poses is not None:
             require_spanning(relative_covariance(fitted), fitted.names, poses, where)
         elif shown:
@@ -84,7 +85,7 @@ def require_spanning(
         )
 
 
-def refuse_undetermined(fitted: Fit, prior: Prior | None = None, wholly: bool = False) -> None:
+def refuse_undetermined(fitted: Fit, prior: Prior | None, wholly: bool = False) -> None:
     """Raise `NotPossibleError` for a fitted effect that was not told from all else that was fitted.
 
     An effect of which a prior says something is let through; with `wholly` one of which a part is determined, too.
@@ -119,4 +120,4 @@ def relative_covariance(fitted: Fit) -> FloatArray:
 
 def _open_directions(covariance: FloatArray, rows: Sequence[int]) -> int:
     """How many directions of these parameters are known no better than from the data sheet."""
-    return int(np.sum(np.linalg.eigvalsh(covariance[np.ix_(rows, rows)]) > UNDETERMINED**2))
+    return int(np.sum(np.linalg.eigvalsh(submatrix(covariance, rows)) > UNDETERMINED**2))

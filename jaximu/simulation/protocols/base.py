@@ -25,9 +25,9 @@ class Plan:
     columns: tuple[str, ...] = ()  # of `Recording`: temperature, ambient_temperature, current, attitude, table_rate
 
 
-def may_be_zero(default: float = 0.0) -> Any:
-    """Return a field of a protocol that may be zero, as others may not."""
-    return field(default=default, metadata={"zero": True})
+def may_be_zero() -> Any:
+    """Return a field of a protocol that may be zero and is unless stated, as others may not."""
+    return field(default=0.0, metadata={"zero": True})
 
 
 def signed(default: float | tuple[float, float, float]) -> Any:

@@ -88,7 +88,7 @@ class Motion(eqx.Module):
     def padded(self) -> Motion:
         """Return the motion with segments that never begin: few numbers of segments, and few programs."""
         rows, count = np.arange(padded_size(len(self.start))), len(self.start)
-        segments = {name: np.asarray(values) for name in _OF_SEGMENTS if len(values := getattr(self, name))}
+        segments = {name: values for name in _OF_SEGMENTS if len(values := getattr(self, name))}
         longer = part_of(segments, np.minimum(rows, count - 1))
         return replace(self, **longer | {"start": np.where(rows < count, longer["start"], np.inf)})
 
