@@ -143,8 +143,8 @@ class _Shared:
         gyroscopes = [recording.signals["gyroscope"] for recording in corrected]
         slowest = min(signal.rate for signal in gyroscopes)
         length = _LENGTH / slowest
-        begin = max(signal.time[0] + delay for signal, delay in zip(gyroscopes, delays, strict=True)) + 2 * length
-        end = min(signal.time[-1] + delay for signal, delay in zip(gyroscopes, delays, strict=True)) - 2 * length
+        spans = np.array([signal.time[[0, -1]] + delay for signal, delay in zip(gyroscopes, delays, strict=True)])
+        begin, end = spans[:, 0].max() + 2 * length, spans[:, 1].min() - 2 * length
         rests = calibration.segmentations[0].intervals
         rests = rests[(rests[:, 0] > begin) & (rests[:, 1] < end)]
         start = np.arange(begin, end - length, length)
@@ -152,19 +152,19 @@ class _Shared:
         near = _NEAR / slowest
         measured = np.searchsorted(unseen, start - near) == np.searchsorted(unseen, start + length + near)
         start = start[~still & measured]
-        speed = lengths_of(means_over(gyroscopes[0], np.stack([start, start + length], axis=1)))
-        start, speed = start[speed > _SLOW], speed[speed > _SLOW]
-        if len(start) < _FEWEST or len(rests) < 3:
+        windows = np.stack([start, start + length], axis=1)
+        speed = lengths_of(means_over(gyroscopes[0], windows))
+        windows, speed = windows[speed > _SLOW], speed[speed > _SLOW]
+        if len(windows) < _FEWEST or len(rests) < 3:
             raise NotPossibleError(
                 f"{first.name}: the units were at rest {len(rests)} times and turned together for "
-                f"{len(start) * length:.2g} s while all were recorded; an array needs three rests and ten seconds of "
+                f"{len(windows) * length:.2g} s while all were recorded; an array needs three rests and ten seconds of "
                 "turns, quick ones about all axes."
             )
         order = np.argsort(-speed)
         quick, others = order[: _WINDOWS // 2], np.sort(order[_WINDOWS // 2 :])
         evenly = others[:: max(1, -(-len(others) // (_WINDOWS // 2)))]
-        chosen = np.sort(np.concatenate([quick, evenly]))
-        return cls(first, rests, np.stack([start[chosen], start[chosen] + length], axis=1))
+        return cls(first, rests, windows[np.sort(np.concatenate([quick, evenly]))])
 
     def means(self, recording: Recording, delay: float) -> tuple[FloatArray, FloatArray]:
         """Return a unit's mean forces at rest (P, 3) and mean rates in motion (S, 3)."""
@@ -258,12 +258,8 @@ def _prior(imu: Imu, calibration: Calibration, first: Calibration, back: FloatAr
     known = calibration.covariance_of(names)
     covariance = known + blur @ first.covariance_of(names) @ blur.T + np.diag((_LITTLE * sizes) ** 2)
     # what is not known stands: it says what is turned
-    rows = [
-        row
-        for row, name in enumerate(names)
-        if known[row, row] > 0 and (name.owner == "accelerometer" or name.part == "gain")
-    ]
-    covariance[rows, rows] += sizes[rows] ** 2
+    axes = np.array([name.owner == "accelerometer" or name.part == "gain" for name in names])
+    covariance += np.diag(np.where(axes & (np.diagonal(known) > 0), sizes, 0.0) ** 2)
     root = scipy.linalg.block_diag(np.linalg.inv(np.linalg.cholesky(covariance)), effects.root)
     return Prior((*names, *effects.names), np.concatenate([flatten(bare), effects.mean]), root)
 
