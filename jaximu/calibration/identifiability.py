@@ -64,10 +64,8 @@ def separated(shapes: ThermalShapes) -> dict[str, Separation]:
     root = np.sqrt(blocks.stop - blocks.start)[:, None]
     levels, drift = np.eye(blocks.levels)[blocks.level], np.eye(int(blocks.log.max()) + 1)[blocks.log]
     drift = drift * (blocks.start / np.max(np.abs(blocks.stop)))[:, None]
-    mean, base = (
-        orthonormal(root * levels),
-        orthonormal(root * np.concatenate([levels, drift, shapes.smooth()], axis=1)),
-    )
+    mean = orthonormal(root * levels)
+    base = orthonormal(root * np.concatenate([levels, drift, shapes.smooth()], axis=1))
     grids: dict[str, list[ThermalTerm]] = {name: [ThermalTerm(name)] for name in RATES}
     grids |= {name: [history(name, value) for value in values] for name, values in shapes.grids.items()}
     columns = {name: [root[:, 0] * shapes.column(term)[0] for term in grid] for name, grid in grids.items()}
@@ -124,8 +122,8 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
         words.append(" ".join(sentences))
     else:
         words.append("This path of temperature separates every rate term, a lag and a hysteresis.")
-    base = orthonormal(np.concatenate([np.eye(blocks.levels)[blocks.level], shapes.smooth()], axis=1))
-    mean = orthonormal(np.eye(blocks.levels)[blocks.level])
+    levels = np.eye(blocks.levels)[blocks.level]
+    base, mean = orthonormal(np.concatenate([levels, shapes.smooth()], axis=1)), orthonormal(levels)
     scale = max(_length(off(base, column)) / _length(off(mean, column)) for column in shapes.column(ThermalTerm(SCALE)))
     if scale > _TOLD and blocks.several_poses:
         observable.append(SCALE)

@@ -18,7 +18,6 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from jaximu._version import __version__
 from jaximu.calibration.calibration import Calibration, provenance
 from jaximu.calibration.identifiability import Identifiability, identifiable
 from jaximu.calibration.nominal import nominal_imu
@@ -34,7 +33,7 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.track import TEMPERATURE_WINDOW, Track
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import Document, Json, entries
+from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD
 from jaximu.ground.page import Result
@@ -77,7 +76,7 @@ class ThermalCalibration(Result, Document, page="thermal"):
     reference: float
     notes: tuple[str, ...] = ()
     jumps: tuple[tuple[int, float], ...] = ()  # recording, and time on its clock, s
-    software: dict[str, str] = field(default_factory=lambda: {"name": "jaximu", "version": __version__})
+    software: dict[str, str] = field(default_factory=SOFTWARE.copy)
 
     def bias(self, triad: str, temperature: FloatArray, rate: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """Return the change of bias (m, 3) from the reference temperature to temperatures (m,) °C, and its sigma, SI.
@@ -103,7 +102,7 @@ class ThermalCalibration(Result, Document, page="thermal"):
                     f"{PREFIXES[name]}.{effect}.{key}": {"value": value, "sigma": spread}
                     for (effect, key), (value, spread) in fit.inner.items()
                 },
-                "rms": {"before": fit.before.tolist(), "after": fit.after.tolist()},
+                "rms": entries(fit, "before", "after"),
                 "heldout_rms": {"before": fit.held_before.rms.tolist(), "after": fit.candidate.held.rms.tolist()},
                 "chi_squared_per_freedom": fit.chi_squared.tolist(),
                 "candidates": [

@@ -237,21 +237,20 @@ def best_by_axis(candidates: Sequence[Candidate]) -> list[int]:
     A slow walk predicts a stretch from its neighbours nearly as well as a model does, and only the model corrects
     another recording: what the terms alone leave of the stretches left out decides between what is about as likely.
     """
-    (plain,) = (candidate for candidate in candidates if candidate.family == "constant")
+    (plain,) = (k for k, candidate in enumerate(candidates) if candidate.family == "constant")
+    measures = np.array([(candidate.held.rms, candidate.costs, candidate.scores) for candidate in candidates])
     chosen = []
     for axis in range(3):
-        rms = np.array([candidate.held.rms[axis] for candidate in candidates])
-        costs = np.array([candidate.costs[axis] for candidate in candidates])
-        scores = np.array([candidate.scores[axis] for candidate in candidates])
-        helps = (rms < plain.held.rms[axis]) & (costs < plain.costs[axis])
-        helps |= [candidate is plain for candidate in candidates]
+        rms, costs, scores = measures[:, :, axis].T
+        helps = (rms < rms[plain]) & (costs < costs[plain])
+        helps[plain] = True
         close = helps & (scores > scores[helps].max() - PAYS)
         close &= rms <= _ALIKE * rms[close].min()
 
         def complexity(k: int, axis: int = axis) -> tuple[bool, float, float]:
             # a spline of few pieces is no simpler than a polynomial
             learned = any(term.name == LEARNED for term in candidates[k].model[axis])
-            return learned, candidates[k].numbers[axis], -candidates[k].scores[axis]
+            return learned, candidates[k].numbers[axis], -measures[k, 2, axis]
 
         chosen.append(min(np.flatnonzero(close).tolist(), key=complexity))
     return chosen
