@@ -155,8 +155,8 @@ def calibrate_table_ready(
     start = on_host(nominal.with_effects(*chosen))
     fitted = fit_turntable(start, stations, free, loss)
     where = ", ".join(recording.name for recording in recordings)
-    used = np.asarray(stations.accelerometer_used) | np.asarray(stations.gyroscope_used)
-    poses, turns = (int(np.sum(used & (np.asarray(stations.turn) == kind))) for kind in (False, True))
+    used = stations.accelerometer_used | stations.gyroscope_used
+    poses, turns = (int(np.sum(used & (stations.turn == kind))) for kind in (False, True))
     shown = f"the reference has {counted(poses, 'pose')} and {counted(turns, 'turn')} that can be used, which"
     require_determined(fitted, where, shown, _RECORD)
     fitted = _at_rest_where_open(fitted, start)
@@ -194,8 +194,7 @@ def _turned_as_a_whole(calibration: Calibration) -> list[str]:
     open_gains = {name.partition(".")[0] for name in calibration.open_numbers if ".gain[" in name}
     notes = []
     for sensor in sorted({name.owner for name in calibration.names if name.part == "gain"} - open_gains):
-        gain = np.asarray(calibration.triads()[sensor].gain)
-        rotation, _ = scipy.linalg.polar(unit_vectors(gain))
+        rotation, _ = scipy.linalg.polar(unit_vectors(calibration.triads()[sensor].gain))
         vector = scipy.spatial.transform.Rotation.from_matrix(rotation).as_rotvec(degrees=True)
         if _TURNED < np.linalg.norm(vector) < _ARRANGED:
             about = ", ".join(f"{axis} {angle:+.2g}°" for axis, angle in zip("xyz", vector, strict=True))
