@@ -196,7 +196,7 @@ def _of_shape(calibration: Calibration, measurement: AgainstAttitude) -> FloatAr
     """
     data, imu = measurement.intervals, calibration.imu
     matrix = np.asarray(imu.triads()["gyroscope"].inverse())
-    rate, slope = np.asarray(data.rate) @ matrix[:, :3].T + matrix[:, 3], np.asarray(data.slope) @ matrix[:, :3].T
+    rate, slope = data.rate @ matrix[:, :3].T + matrix[:, 3], data.slope @ matrix[:, :3].T
     spread = abs(float(Mounting.of(imu).filter_variance))
     delay = spread**1.5 / 3 * np.sum(slope**2) / np.sum(rate**2)
     effects = imu.all_effects()
@@ -204,7 +204,7 @@ def _of_shape(calibration: Calibration, measurement: AgainstAttitude) -> FloatAr
     return delay**2 * np.diag(delayed)
 
 
-def _begin(recording: Recording, start: _Start, effects: Sequence[Effect], unit: Imu | None = None) -> Imu:
+def _begin(recording: Recording, start: _Start, effects: Sequence[Effect], unit: Imu | None) -> Imu:
     """Return the unit, the data sheet's if None, under the reference as it was coarsely aligned."""
     turned = scipy.spatial.transform.Rotation.from_matrix(start.matrix.T).as_rotvec()
     arm = {} if start.attitude.velocities() is None else {"lever_arm": 0.0}
@@ -220,7 +220,7 @@ def _begin(recording: Recording, start: _Start, effects: Sequence[Effect], unit:
 
 def later_zero(start: float, other: float) -> float:
     """Return how much later (s) one zero of time is than another; none where the two are not on one clock."""
-    later = float(start) - float(other)
+    later = start - other
     return later if abs(later) < _APART else 0.0
 
 
@@ -274,11 +274,9 @@ def _coarse(recording: Recording, attitude: Attitude) -> _Start:
             f"{attitude.name} lies from {attitude.time[0]:.6g} to {attitude.time[-1]:.6g} s and {name} from "
             f"{span[0]:.6g} to {span[1]:.6g} s: they do not overlap. Put both on one clock, or let both begin at zero."
         )
-    rate = lengths_of(attitude.turned()) / np.diff(attitude.time)
-    if np.sqrt(np.nanmean(rate**2)) < _LEAST:
-        raise NotPossibleError(
-            f"{attitude.name} hardly turns ({np.degrees(np.sqrt(np.nanmean(rate**2))):.2g} °/s, rms): {_RECORD}"
-        )
+    rate = np.sqrt(np.nanmean((lengths_of(attitude.turned()) / np.diff(attitude.time)) ** 2))
+    if rate < _LEAST:
+        raise NotPossibleError(f"{attitude.name} hardly turns ({np.degrees(rate):.2g} °/s, rms): {_RECORD}")
     delays = _delays(recording, attitude)
     delay, plain = delays[0], _matched(recording, attitude, delays[0])
     for other in delays[1:]:  # turns at regular times, as a robot makes them, look alike but for their axes
@@ -410,9 +408,9 @@ def _rates(recording: Recording, attitude: Attitude, delay: float) -> tuple[Floa
         attitude, time=attitude.time[::stride], quaternion=attitude.quaternion[::stride], velocity=None, position=None
     )
     stamps = thin.time - delay
-    good = (stamps[:-1] > gyroscope.time[0]) & (stamps[1:] < gyroscope.time[-1])
-    good &= np.diff(stamps) < 2.5 * stride * attitude.period
     length = np.diff(stamps)[:, None]
+    good = (stamps[:-1] > gyroscope.time[0]) & (stamps[1:] < gyroscope.time[-1])
+    good &= length[:, 0] < 2.5 * stride * attitude.period
     turned = thin.turned() / length
     good &= ~np.isnan(turned).any(axis=1)
     unit = Integral(gyroscope).over(stamps[:-1], stamps[1:]) / length
@@ -436,8 +434,8 @@ def delays_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray, 
     step = max(period, 1 / gyroscope.rate, 5e-3)
     first, last = min(gyroscope.time[0], stamps[0]), max(gyroscope.time[-1], stamps[-1])
     grid = np.arange(first, last, step)
-    kernel = np.ones(max(1, round(step * gyroscope.rate))) / max(1, round(step * gyroscope.rate))
-    unit = np.interp(grid, gyroscope.time, np.convolve(size, kernel, "same"), 0.0, 0.0)
+    count = max(1, round(step * gyroscope.rate))
+    unit = np.interp(grid, gyroscope.time, np.convolve(size, np.ones(count) / count, "same"), 0.0, 0.0)
     shifted = np.interp(grid, stamps, speeds, 0.0, 0.0)
     inside = [(grid >= a) & (grid <= b) for a, b in ((gyroscope.time[0], gyroscope.time[-1]), (stamps[0], stamps[-1]))]
     a, b = (
@@ -447,8 +445,8 @@ def delays_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray, 
     def against(x, y):
         return scipy.signal.correlate(y, x, mode="full", method="fft")
 
-    power = against(a**2, inside[1].astype(float)) * against(inside[0].astype(float), b**2)
-    together = against(inside[0].astype(float), inside[1].astype(float))
+    measured, known = (here.astype(float) for here in inside)
+    power, together = against(a**2, known) * against(measured, b**2), against(measured, known)
     enough = together > 0.3 * min(here.sum() for here in inside)
     score = np.where(enough, against(a, b) / np.sqrt(np.maximum(power, 1e-30)), -1.0)
     lags = (np.arange(len(score)) - (len(grid) - 1)) * step
@@ -518,5 +516,5 @@ def _rearranged(recording: Recording, attitude: Attitude, delay: float) -> _Star
 
 def _smooth(recording: Recording) -> FloatArray:
     """Return the accelerometer's output in SI, means over a second."""
-    force, size = recording.accelerometer.si(), max(1, round(recording.accelerometer.rate))
-    return np.asarray(scipy.ndimage.uniform_filter1d(force, size, axis=0))
+    accelerometer = recording.accelerometer
+    return scipy.ndimage.uniform_filter1d(accelerometer.si(), max(1, round(accelerometer.rate)), axis=0)
