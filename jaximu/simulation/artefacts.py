@@ -7,7 +7,7 @@ length can be streamed. They are applied in the order in which they happen: in t
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -185,7 +185,7 @@ class StuckAxis(_OfAnAxis):
     """One axis repeats from `start` to `stop` (s) the last value it had before."""
 
     start: float
-    stop: float = field(default=np.inf)
+    stop: float = np.inf
 
     name = "stuck_axis"
     catalogue = "data.stuck_axis"
