@@ -166,7 +166,7 @@ class Budget(Result, Document, page="budget"):
     def off(self) -> FloatArray:
         """Share (s, p) by which a parameter's total is wrong because the source's first order is."""
         total = self.total
-        changed = np.sqrt(np.maximum(total**2 - self.sigma**2 + self.actual**2, 0))
+        changed = root_or_zero(total**2 - self.sigma**2 + self.actual**2)
         return changed / np.where(total > 0, total, 1.0) - 1
 
     def nonlinear(self) -> list[tuple[int, int]]:

@@ -332,7 +332,7 @@ def _attitude_roots(stops: _Stops, kind: str) -> dict[str, FloatArray]:
     turned = Rotation.from_euler("z", azimuth[:, None])
     zero = np.zeros(count)
     tilting = turned.apply(np.stack([np.cos(polar), zero, -np.sin(polar)], axis=1))
-    spindle = turned.apply(np.array([1.0, 0.0, 0.0]))
+    spindle = turned.apply([1.0, 0.0, 0.0])
     roots = {
         "angle_setting": about if kind in _TURN_ONLY else np.concatenate([about, others], axis=2),
         "mounting": mounting,
