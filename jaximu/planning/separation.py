@@ -25,6 +25,7 @@ from jaximu.diagnosis.experiment import Experiment
 from jaximu.estimation.leave_out import off
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf, noncentral_chi2_sf
+from jaximu.ground.vectors import submatrix
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.noise import drawn_noise
@@ -175,7 +176,7 @@ def _noisy(recording: Recording, noise: NoiseModel) -> Recording:
 def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict[str, float]:
     """By rival of the first effect: the least power, either way, to rule the one out if the other is there."""
     linear, used = experiment.linearise(imu), experiment.used
-    root = np.linalg.cholesky(linear.covariance[np.ix_(used, used)])
+    root = np.linalg.cholesky(submatrix(linear.covariance, used))
     base = _basis(np.linalg.solve(root, linear.slope[used]))
     kinds = [type(effect) for effect in effects]
     if len(experiment.recordings) < 2:  # a recording that could be made is none of those that were
