@@ -274,11 +274,8 @@ def evaluated(
     leaning = share @ jnp.cross(jnp.eye(3), whole.velocity[:, None]).swapaxes(1, 2)
     turned = whole.reaction[..., :3, :] * data.used[:, None, None, None]
     reaction = jnp.concatenate([turned, share[:, None] @ whole.reaction[..., 3:6, :]], axis=-2)
-    by_triad = {
-        name: part.swapaxes(1, 2).reshape(len(samples), 6, -1)
-        for name, part in zip(reversed(TRIADS), jnp.split(reaction, 2, axis=-1), strict=True)
-    }
-    return conditions, spread, duration, leaning, Reactions(by_triad, samples)
+    rows = [part.swapaxes(1, 2).reshape(len(samples), 6, -1) for part in jnp.split(reaction, 2, axis=-1)]
+    return conditions, spread, duration, leaning, Reactions(dict(zip(reversed(TRIADS), rows, strict=True)), samples)
 
 
 def shared_ends(back: Float[Array, "T 3 3"], leaning: Float[Array, "T 3 3"], windows: int) -> BlockFactor:
@@ -490,7 +487,7 @@ class AgainstAttitude(OfOneUnit):
         covariance = self._covariance(conditions, spread, duration, leaning, white)
         return About(conditions, covariance, columns, details=AttitudeDetails(duration, reactions, self, imu))
 
-    def _freed(self, imu: Imu) -> tuple[Intervals, dict[str, FloatArray]]:
+    def _freed(self, imu: Imu) -> tuple[Intervals, dict[str, Array]]:
         """Return what was recorded without what effects add, and the slopes (m, 3, q) of that by their numbers.
 
         How the reference stands adds nothing.

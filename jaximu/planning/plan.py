@@ -167,11 +167,10 @@ class Known:
     def from_specification(cls, specification: Specification) -> Known:
         """Return the first unit of a specification as its data sheet, with its white noise; nothing calibrated yet."""
         case = specification.case(0)
-        squares = {name: noise_squares(case, name).get("N") for name in case.imu.triads()}
         noise = {
-            name: _in_output(triad, np.diag(squares[name]))
+            name: _in_output(triad, np.diag(white))
             for name, triad in case.imu.triads().items()
-            if squares[name] is not None
+            if (white := noise_squares(case, name).get("N")) is not None
         }
         gravity = LocalGravity(float(case.plan.motion.gravity), 0.0)
         return cls(
@@ -582,7 +581,7 @@ def _starts(poses: int, turns: int, equipment: Equipment, seed: int) -> list[Des
 
     def spread(count: int) -> FloatArray:
         even = spiral(count)
-        up = rng.permutation(Rotation.random(None, rng).apply(even)) if count else even
+        up = np.asarray(rng.permutation(Rotation.random(None, rng).apply(even)) if count else even, float)
         if equipment.z_up:
             up[:, 2] = np.abs(up[:, 2])
         return up
