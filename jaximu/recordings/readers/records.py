@@ -24,7 +24,7 @@ from jaximu.recordings.readers.arrays import table_of
 from jaximu.recordings.readers.clock import seconds_of
 from jaximu.recordings.recording import Source
 
-_TAGS = "sensor sensorname sensor_name type name topic".split()
+_TAGS = ("sensor", "sensorname", "sensor_name", "type", "name", "topic")
 _ANDROID = {"accel": "m/s^2", "gyro": "rad/s", "mag": "uT"}
 
 
