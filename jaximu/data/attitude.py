@@ -67,6 +67,7 @@ WINDOW, _WITH_VELOCITY = 2.0, 1.0
 known, as few windows cannot tell their noise from what an accelerometer does wrong. With windows of 0.5 s intervals
 came out a tenth too small in recordings of 30 s, which show too little of the noise that does not average out."""
 _MARGIN, _BUCKET = 3, 32
+"""Samples beside an interval, for the delay to move; and multiples that its samples are padded to: few programs."""
 _SMOOTH = 0.05
 """Seconds over which the slope of the rate is taken."""
 _MOVING = ("delay", "clock_scale")

@@ -53,5 +53,3 @@ def find(samples: Samples) -> Iterator[Finding]:
             spoils=True,
             refuses="accelerometer",
         )
-        return
-    return

@@ -61,7 +61,7 @@ def advised(diagnosis: Diagnosis) -> Diagnosis:
     """Return a diagnosis that says what would settle its first cause with rivals, or else its first weak one.
 
     Where a set-up's own error is the cause or a rival it is left as it is: no recording that is tried here shows one.
-    So it is where none would show more than this recording does.
+    It is left as well where none of the recordings that are tried would show more than this one does.
     """
     unsettled = [cause for cause in diagnosis.named if cause.rivals] or [
         cause for cause in diagnosis.named if cause.weak
