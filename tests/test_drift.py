@@ -11,14 +11,18 @@ from jaximu import (
     CATALOGUE,
     LocalGravity,
     ReadOptions,
+    Recording,
+    Signal,
     calibrate,
     compensate,
     diagnose,
     load_calibration,
     read_recording,
+    write_recording,
 )
 from jaximu.data.drift import restricted_likelihood
 from jaximu.diagnosis.diagnosis import recorded_by_hand
+from jaximu.recordings.recording import one_after_another
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 USUAL = {name: hidden.FLICKER[short] / hidden.WHITE[short] for name, short in
@@ -74,7 +78,7 @@ def test_biases_of_another_power_on_are_no_effect(static, tmp_path):
     assert abs(np.log(size * hidden.WHITE["accel"] / 0.03)) < 3 * max(relative, 0.3)  # six numbers tell it
     tested = {*found.detection_limits, *found.not_observable}
     assert {f"gyro.step@{number}" for number in (1, 2, 3)} <= tested  # in each recording by itself
-    assert "gyro.step" not in tested
+    assert not {"gyro.step", "gyro.warm_up@all"} & tested
 
 
 def drifting_in_the_second(folder, *others):
@@ -108,6 +112,39 @@ def test_a_ramp_of_one_recording_is_named_in_it(tmp_path):
     assert not read.imu.transferable().all_effects()  # no other recording is corrected by it
     corrected, plain = (compensate(one, recordings[1]) for one in (read, replace(read, imu=read.imu.with_effects())))
     np.testing.assert_array_equal(corrected.signals["gyroscope"].values, plain.signals["gyroscope"].values)
+
+
+def test_what_dies_away_after_power_on_goes_on_in_the_next_recording(tmp_path):
+    name = "gyro.warm_up"
+    case = hidden.draw_case(1306, (name,), poses=32, inner={name: {"time_constant": 90.0}}).with_size(10.0)
+    whole = read_recording(case.write(tmp_path, ("fit",))["fit"])
+    stop = float(whole.accelerometer.time[-1])
+    logs = []
+    for number, (first, last) in enumerate([(0.0, 0.45 * stop), (0.5 * stop, stop)]):
+        part = {}
+        for key, of in whole.signals.items():
+            rows = (of.time >= first) & (of.time <= last)
+            part[key] = replace(of, time=of.time[rows] - first, values=of.values[rows])
+        logs.append(tmp_path / f"{number}.parquet")
+        write_recording(replace(whole, **part, start=1.7e9 + first), logs[-1])
+    found = diagnose([read_recording(log) for log in logs], GRAVITY)
+    (effect,) = found.effects
+    assert effect.name == "gyro.warm_up@all" and not effect.rivals
+    np.testing.assert_array_less(np.abs(effect.effect.coefficients - case.hidden[0].coefficients), 4 * effect.sigma)
+    assert "gyroscope warm-up over all recordings" in effect.sentence()
+    found.extended_calibration().save(tmp_path / "calibration.json")
+    (read,) = load_calibration(tmp_path / "calibration.json").imu.all_effects().values()
+    assert read.name == effect.name == found.document()["effects"][0]["name"]
+
+
+def test_recordings_follow_each_other_by_their_stamps():
+    signal = Signal(np.arange(11.0), np.zeros((11, 3)), "m/s^2")
+    logs = [Recording(signal, start=start) for start in (122.0, 100.0, 111.0)]
+    assert one_after_another(logs) == [22.0, 0.0, 11.0]
+    assert one_after_another(logs[:2]) == [22.0, 0.0]
+    for start in (105.0, 131.0):  # the stamps overlap; or the pause is longer than what was recorded
+        assert one_after_another([logs[1], Recording(signal, start=start)]) == []
+    assert one_after_another(logs[:1]) == []
 
 
 def test_a_ramp_of_one_recording_stands_beside_what_the_unit_does_in_both(tmp_path):

@@ -23,7 +23,7 @@ from jaximu.ground.rotation import IDENTITY, UP, multiply
 from jaximu.ground.tracing import array_module
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations
-from jaximu.recordings.recording import Signal
+from jaximu.recordings.recording import Signal, one_after_another
 from jaximu.recordings.segmentation import Segmentation
 
 _NONE = np.iinfo(np.int64).max
@@ -113,6 +113,11 @@ def samples_by_hand(segmentations: Sequence[Segmentation], observations: Observa
     for part, shift in zip(segmentations, rest_shifts(segmentations), strict=True):
         samples.append(SamplesByHand.of(part, first, interval, shift))
         first += len(part.intervals)
+    starts = one_after_another([part.recording for part in segmentations])
+    if starts:
+        samples = [
+            replace(of, recorded=of.recorded.in_session(start)) for of, start in zip(samples, starts, strict=True)
+        ]
     return tuple(samples)
 
 

@@ -153,7 +153,7 @@ class Named:
             for name, parameter in self.effect.inner.items()
         }
         return {
-            "name": self.effect.within(0).name,
+            "name": self.effect.acting().name,
             **({"recording": self.effect.recording} if self.effect.recording else {}),
             **entries(self, "p_value", "weak", "sigma", "unit", "evidence"),
             "indistinguishable_from": list(self.rivals),
@@ -359,8 +359,9 @@ def diagnose(
 
     - `recordings`: several of one unit show together what one hardly does. Each has its own biases, as after another
       power-on; effects that belong to one recording (steps, ramps, warm-up, a drift along a curve) are tested in each
-      and act in that one alone: "gyro.bias_ramp@2" is a ramp in the second. Or data of another kind, such as
-      `jaximu.data.RecordedStations`, as [`jaximu.calibrate`][] takes them.
+      and act in that one alone: "gyro.bias_ramp@2" is a ramp in the second. Where absolute stamps tell that recordings
+      follow each other, ramps and warm-up are also tested over all of them: "gyro.warm_up@all". Or data of another
+      kind, such as `jaximu.data.RecordedStations`, as [`jaximu.calibrate`][] takes them.
     - `start`: with data, as for [`jaximu.calibrate`][].
     - `gravity`: where it states a latitude, the Earth's rotation is no finding: it is taken off.
     - `static`: a recording of the unit at rest, or its `NoiseModel`. Without one the noise is taken from the poses

@@ -29,7 +29,7 @@ from jaximu.model.effects.base import Extent, Kind
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.finding import Finding
-from jaximu.recordings.recording import Recording
+from jaximu.recordings.recording import Recording, one_after_another
 
 LEAST_WARMING = 0.2
 """K of change below which a recording shows nothing of temperature."""
@@ -287,11 +287,16 @@ class Experiment(Data):
         return askable, refused
 
     def by_recording(self, kind: type[Kind]) -> list[type[Kind]]:
-        """Return an effect as it is asked: of a session once for each of several recordings, acting in it alone."""
+        """Return an effect as it is asked: of a session once for each of several recordings, acting in it alone.
+
+        Where recordings follow each other, what dies away or grows after power-on is also asked once over all of them.
+        """
         count = len(self.recordings)
         if kind.scope != "session" or count < 2 or not self.data.by_hand:  # by hand each has its own time and heading
             return [kind]
-        return [kind.within(number) for number in range(1, count + 1)]
+        kinds = [kind.within(number) for number in range(1, count + 1)]
+        follow = kind.carries_on and one_after_another(self.recordings)
+        return [*kinds, kind.throughout()] if follow else kinds
 
     def largest(self, state: State, effect: Effect) -> dict[str, float]:
         """Return the most (SI) that an effect adds to each triad's output in these recordings."""

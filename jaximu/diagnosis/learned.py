@@ -71,7 +71,7 @@ class LearnedTerm:
         kinds = {kind: (before, self.gain.after.rms[kind]) for kind, before in self.gain.before.rms.items()}
         output = getattr(self.state.imu, self.triad).output_unit
         return {
-            "name": self.effect.within(0).name,
+            "name": self.effect.acting().name,
             "covariate": self.covariate,
             "triad": self.triad,
             **self.effect.document(output),

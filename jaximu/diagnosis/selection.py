@@ -158,14 +158,26 @@ def criterion(evidence: Evidence, scores: Scores, block: int) -> float:
 
 
 def _leaders(evidence: Evidence, scores: Scores) -> list[int]:
-    """Return the best block of every effect, by the criterion, whose own test is significant at all."""
+    """Return the best block of every effect, by the criterion, whose own test is significant at all.
+
+    One whose time goes on over all recordings is left out where what is best in each of them alone explains more.
+    """
     leaders: dict[str, int] = {}
     for k, block in enumerate(evidence.blocks):
         if block.kind == "generic" or not scores.freedom[k] or scores.p_value[k] > LEVEL:
             continue
         if block.name not in leaders or scores.statistic[k] > scores.statistic[leaders[block.name]]:
             leaders[block.name] = k
-    return sorted(leaders.values(), key=lambda k: -criterion(evidence, scores, k))
+    ranks = {name: criterion(evidence, scores, k) for name, k in leaders.items()}
+    for name in [name for name in leaders if name.endswith("@all")]:
+        alone: dict[str, float] = {}
+        for other, rank in ranks.items():
+            number = other.partition("@")[2]
+            if number.isdecimal() and other.partition(".")[0] == name.partition(".")[0]:
+                alone[number] = max(alone.get(number, -np.inf), rank)
+        if len(alone) > 1 and sum(alone.values()) > ranks[name]:
+            del leaders[name]
+    return sorted(leaders.values(), key=lambda k: -ranks[evidence.blocks[k].name])
 
 
 def _cause(evidence: Evidence, explaining: Sequence[int], scores: Scores) -> SelectedCause:

@@ -31,7 +31,7 @@ from jaximu.model.effects.base import Effect, Extent, Place, inner_owners
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.finding import Finding
-from jaximu.recordings.recording import Recording
+from jaximu.recordings.recording import Recording, one_after_another
 
 _GRID = 16
 """Inner parameters of an effect are asked for in multiples of so many."""
@@ -193,7 +193,7 @@ class Data(ABC):
         numerics = array_module(imu, details)
         effects, columns = imu.all_effects(), [numerics.zeros((rows, 0))]
         for effect in effects.values():
-            kind, recording = type(effect).within(0), type(effect).recording
+            kind, recording = type(effect).acting(), type(effect).recording
             if self.no_fixture and effect.scope == "fixture":
                 columns.append(numerics.zeros((rows, effect.size + len(effect.inner))))
                 continue
@@ -224,7 +224,7 @@ class Data(ABC):
         key, react, parts = self.reactions(details)
         longest: dict[str, int] = {}
         for kind, grid in grids.items():
-            longest[kind.within(0).name] = max(longest.get(kind.within(0).name, 0), len(grid))
+            longest[kind.acting().name] = max(longest.get(kind.acting().name, 0), len(grid))
 
         def derivatives(kinds, imu, part, *inner):
             def at(kind, values):
@@ -241,7 +241,7 @@ class Data(ABC):
         columns: dict[type[Effect], FloatArray] = {}
         for number, part in enumerate(parts, 1):
             acting = [kind for kind in grids if kind.recording in (0, number)]
-            kinds, inner = [kind.within(0) for kind in acting], []
+            kinds, inner = [kind.acting() for kind in acting], []
             for kind, whole in zip(acting, kinds, strict=True):
                 grid, count = grids[kind], longest[whole.name]
                 values = np.array([[point[name] for name in kind.inner] for point in grid]).reshape(
@@ -294,11 +294,13 @@ class Data(ABC):
         """Return what a recording spans, by its number, or all of them (0): effects may begin between observations."""
         chosen = slice(recording - 1, recording) if recording else slice(None)
         spans = self.spans()[chosen]
+        starts = one_after_another(self.recordings)
         temperatures = [log.temperature.values for log in self.recordings[chosen] if log.temperature is not None]
         return Extent(
             max(float(part[-1, 1] - part[0, 0]) for part in spans),
             tuple(float(time) for part in spans for time in (part[:-1, 1] + part[1:, 0]) / 2),
             max((float(np.ptp(values)) for values in temperatures), default=0.0),
+            max((start + part[-1, 1] for start, part in zip(starts, self.spans(), strict=False)), default=0.0),
         )
 
     def tracks(self, details: Any) -> list[dict[str, Track]]:

@@ -148,6 +148,10 @@ class Recorded(eqx.Module):
                 return recorded.asked_for_vibration(stands_out=True)
         return recorded
 
+    def in_session(self, start: float) -> Recorded:
+        """Return the same of a recording whose clock was at zero so many seconds after a session began."""
+        return replace(self, known={name: replace(of, session_time=start + of.time) for name, of in self.known.items()})
+
     def asked_for_vibration(self, stands_out: bool = False) -> Recorded:
         """Return the same with vibration among what the unit went through, zero unless it stands out."""
         return self if self.shaken is not None else replace(self, shaken=np.bool_(stands_out))

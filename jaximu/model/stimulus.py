@@ -25,8 +25,9 @@ class Stimulus(eqx.Module):
     temperature (...) °C, temperature_rate (...) °C/s, time (...) s on the recording's clock, attitude (..., 4) unit
     quaternion, body to level frame (x east or any fixed heading, z up), vibration_power (...) (m/s²)², the mean square
     of the vibration's acceleration, all directions together, magnetic_field (..., 3) µT, current (...) A, that flows in
-    or beside the unit. Vectors are in the body frame. temperature_reference (°C) and time_reference (s) are what
-    effects count from; `memory` is what effects with a memory carry over from the path before this one, by name.
+    or beside the unit, session_time (...) s since the first of recordings that follow each other began. Vectors are in
+    the body frame. temperature_reference (°C) and time_reference (s) are what effects count from; `memory` is what
+    effects with a memory carry over from the path before this one, by name.
     """
 
     specific_force: Vector | None = None
@@ -39,6 +40,7 @@ class Stimulus(eqx.Module):
     vibration_power: Numbers | None = None
     magnetic_field: Vector | None = None
     current: Numbers | None = None
+    session_time: Numbers | None = None
     memory: dict[str, Float[Array, "... _"]] | None = None
     temperature_reference: float = eqx.field(static=True, default=REFERENCE_TEMPERATURE)
     time_reference: float = eqx.field(static=True, default=0.0)

@@ -386,6 +386,19 @@ def recordings_of(recordings: Any, *others: type) -> list[Any]:
     return several
 
 
+def one_after_another(recordings: Sequence[Recording]) -> list[float]:
+    """Return how long (s) after the first of several recordings began each one's clock is at zero, by absolute stamps.
+
+    Empty where they do not follow each other: their stamps overlap, or the pauses are longer than what was recorded.
+    """
+    stamps = [next(iter(log.signals.values())).time for log in recordings]
+    begins, ends = ([log.start + time[end] for log, time in zip(recordings, stamps, strict=True)] for end in (0, -1))
+    pauses, recorded = np.sort(begins)[1:] - np.sort(ends)[:-1], np.sum(ends) - np.sum(begins)
+    if not len(pauses) or min(pauses) < 0 or np.sum(pauses) > recorded:
+        return []
+    return [log.start - min(begins) for log in recordings]
+
+
 def same_outputs(recordings: Sequence[Recording], alone: bool = False) -> tuple[str, ...]:
     """Raise `InputError` where recordings of one unit have not the same sensors and units, or one is there twice.
 

@@ -6,6 +6,7 @@ import inspect
 import secrets
 import sys
 from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, TypeVar
@@ -41,6 +42,7 @@ class Extent(NamedTuple):
     duration: float  # s
     boundaries: tuple[float, ...]  # s, between neighbouring observations
     temperature_range: float  # K
+    session: float = 0.0  # s, from the first to the last of recordings that follow each other
 
     def span(self, unit: str) -> float:
         """Return the whole of it in s or in K."""
@@ -84,6 +86,7 @@ class Effect(eqx.Module):
     size: ClassVar[int] = 3  # number of coefficients q: one an axis, if not stated
     scope: ClassVar[str]  # "device" (belongs to the unit), "session" (to this recording) or "fixture" (to the set-up)
     recording: ClassVar[int] = 0  # of several, the number of the only one in which it acts; 0: it acts in all of them
+    carries_on: ClassVar[bool] = False  # its time may go on from one recording to the next that follows it
     needs: ClassVar[tuple[str, ...]]  # fields of the stimulus
     excited_by: ClassVar[str]
     look_alikes: ClassVar[tuple[str, ...]] = ()
@@ -109,6 +112,7 @@ class Effect(eqx.Module):
             cls.owner = SENSORS.get(prefix, prefix)
             common = cls.common_name or cls.plain.replace("_", " ")
             within = f" in recording {cls.recording}" if cls.recording else ""
+            within = " over all recordings" if cls.name.endswith("@all") else within
             cls.english = (common if prefix == "setup" else f"{cls.owner} {common}") + within
             cls.title = f"{cls.english} ({cls.name})"
             if not cls.built_in():
@@ -128,13 +132,23 @@ class Effect(eqx.Module):
         whole = next(kind for kind in cls.__mro__ if kind.__dict__.get("name") == cls.name.partition("@")[0])
         return _within(whole, recording) if recording else whole
 
+    @classmethod
+    def throughout(cls) -> Any:
+        """Return the effect whose time goes on over recordings that follow each other, called "NAME@all"."""
+        return _throughout(cls.within(0))
+
+    @classmethod
+    def acting(cls) -> Any:
+        """Return the class that computes it: of an effect in one recording, the whole effect."""
+        return cls.within(0) if cls.recording else cls
+
     def in_recording(self, number: int) -> Effect:
         """Return the effect as a recording of this number has it: with coefficients of zero where it does not act."""
         kind = type(self)
         if not kind.recording:
             return self
         acts = float(kind.recording == number)
-        return kind.within(0)(acts * self.coefficients, **{name: getattr(self, name) for name in kind.inner})
+        return kind.acting()(acts * self.coefficients, **{name: getattr(self, name) for name in kind.inner})
 
     @classmethod
     def import_path(cls) -> str:
@@ -240,6 +254,18 @@ def inner_owners(effects: Mapping[Place, Effect]) -> dict[Place, Place]:
 def _within(whole: Any, recording: int) -> Any:
     stated = {"name": f"{whole.name}@{recording}", "recording": recording, "__module__": whole.__module__}
     return type(whole)(f"{whole.__name__}In{recording}", (whole,), stated)
+
+
+@cache
+def _throughout(whole: Any) -> Any:
+    def term(self, stimulus):
+        return whole.term(self, replace(stimulus, time=stimulus.need("session_time", self.name)))
+
+    def grid(cls, extent):
+        return whole.grid(extent._replace(duration=extent.session))
+
+    stated = {"name": f"{whole.name}@all", "term": term, "grid": classmethod(grid), "__module__": whole.__module__}
+    return type(whole)(f"{whole.__name__}Throughout", (whole,), stated)
 
 
 class BiasEffect(Effect):

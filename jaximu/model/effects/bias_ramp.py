@@ -9,6 +9,7 @@ class _BiasRamp(BiasEffect):
     formula = "c_i t"
     unit = "output/s"
     scope = "session"
+    carries_on = True
     needs = ("time",)
     excited_by = "time"
     source = "IEEE Std 952-2020, rate ramp"

@@ -50,12 +50,14 @@ _FILES = (
 
 
 class Catalogue(dict[str, type[Effect]]):
-    """Effects by name; those of a session also as "NAME@2", the effect in the second of several recordings alone."""
+    """Effects by name; of a session also as "NAME@2", in the second of several recordings alone, or "NAME@all"."""
 
     def __missing__(self, name: object) -> type[Effect]:
-        """Return an effect in one recording."""
+        """Return an effect in one recording, or over all that follow each other."""
         whole, _, number = str(name).partition("@")
         kind = self.get(whole)
+        if kind is not None and kind.carries_on and number == "all":
+            return kind.throughout()
         if kind is None or kind.scope != "session" or not number.lstrip("0").isdecimal():
             raise KeyError(name)
         return kind.within(int(number))

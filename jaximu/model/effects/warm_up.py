@@ -16,6 +16,7 @@ class _WarmUp(BiasEffect):
     formula = "c_i e^(−t/τ)"
     unit = "output"
     scope = "session"
+    carries_on = True
     needs = ("time",)
     excited_by = "time from power-on"
     source = "IEEE Std 528-2019, warm-up time"
