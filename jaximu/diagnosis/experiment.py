@@ -165,31 +165,14 @@ class Experiment(Data):
 
     def about(self, imu: Imu) -> About:
         """Return the conditions about one unit, the leading axis, and in their covariance all that is not known."""
-        about, noise, unknown, mine = self._evaluated(jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu))
-        if noise is None:
-            return about
-        covariance = jax.tree.map(lambda leaf: leaf[0], about.covariance).dense()
-        covariance = replace(covariance, measured=noise + unknown @ unknown.T)
-        lifted = jax.tree.map(lambda leaf: leaf[None], covariance)
-        conditions: Conditions = about.conditions
-        if np.any(self.shift):
-            conditions = _Shifted(conditions, np.asarray(self.shift)[None])
-        return replace(about, conditions=conditions, covariance=lifted, columns=about.columns[..., mine])
-
-    def _evaluated(self, imu: Imu) -> tuple[About, FloatArray | None, FloatArray, BoolArray]:
-        """Return the data about a unit with what is known, as a batch of one, and what of their covariance is noise.
-
-        With it the covariance (n, n) of noise, None where nothing is beside what was measured; what known effects may
-        do beyond what is known of them (n, q), at one standard deviation; and which columns are the unit's own.
-        """
-        unit = imu.all_effects()
-        whole = imu.with_effects(*unit.values(), *(known.effect for known in self.known))
+        single = jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu)
+        unit = single.all_effects()
+        whole = single.with_effects(*unit.values(), *(known.effect for known in self.known))
         about = self.data.about(jax.tree.map(lambda leaf: np.asarray(leaf)[None], whole))
         names = effect_numbers(whole)[0]
-        mine = np.array([(name.owner, name.effect) in unit for name in names], bool)
         unknown = np.zeros((about.covariance.used.shape[1], 0))
         if self.drift is None and self.excess is None and not self.known and not np.any(self.shift):
-            return about, None, unknown, mine
+            return about
         covariance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.covariance).dense()
         noise = np.array(covariance.measured)
         if self.excess is not None:
@@ -201,7 +184,14 @@ class Experiment(Data):
             (key,) = of_name - set(unit)
             numbers = [(name.owner, name.effect) == key and name.part == "coefficients" for name in names]
             unknown = np.concatenate([unknown, about.columns[0][:, numbers] @ root], axis=1)
-        return about, noise, unknown, mine
+        covariance = replace(covariance, measured=noise + unknown @ unknown.T)
+        lifted = jax.tree.map(lambda leaf: leaf[None], covariance)
+        conditions: Conditions = about.conditions
+        if np.any(self.shift):
+            conditions = _Shifted(conditions, np.asarray(self.shift)[None])
+        mine = np.array([(name.owner, name.effect) in unit for name in names], bool)
+        columns = about.columns[..., mine]
+        return replace(about, conditions=conditions, covariance=lifted, columns=columns, unknown=unknown)
 
     # --- what was recorded ----------------------------------------------------------------------------------------
 
@@ -340,8 +330,9 @@ class Experiment(Data):
         made = self.data.twin(state.imu, state.linear.details, state.linear.conditions, noise, seed)
         if made is not None:
             return Experiment(made, state.imu)
-        noisy = self._evaluated(jax.tree.map(np.asarray, state.imu))[1]
-        assert noisy is not None
+        linear = self.linearise(state.imu) if state.effects else state.linear
+        unknown = np.zeros((len(self.used), 0)) if linear.unknown is None else linear.unknown
+        noisy = linear.covariance - unknown @ unknown.T
         root = np.linalg.cholesky(noisy + np.diag((~self.used).astype(float)))
         drawn = root @ np.random.default_rng(seed).normal(size=len(self.used)) * self.used
         return replace(self, start=state.imu, shift=self.shift + drawn - state.linear.conditions)
@@ -406,7 +397,7 @@ class Experiment(Data):
         That is the mean of their numbers, given the conditions. Near the level a tilted reference looks like a bias of
         the accelerometer; which of both it is, nothing tells.
         """
-        parts = [self._evaluated(state.model)[2]] if self.known else []
+        parts = [] if state.linear.unknown is None else [state.linear.unknown]
         unknown = np.concatenate([*parts, self.data.allowed(len(self.used))], axis=1)[self.used]
         return unknown @ ((state.weights @ unknown).T @ (state.weights @ state.conditions))
 

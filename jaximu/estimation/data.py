@@ -57,13 +57,15 @@ class About:
     """A measurement evaluated about units, the leading axis of every array.
 
     columns (N, n, q): derivatives of the conditions by the effects' numbers, in their own units. details: what the
-    measurement itself needs again.
+    measurement itself needs again. unknown (n, k): what known effects may do beyond what is known of them, at one
+    standard deviation; the covariance has it.
     """
 
     conditions: Conditions
     covariance: Covariance | Chain
     columns: FloatArray
     details: Any = None
+    unknown: FloatArray | None = None
 
 
 @dataclass(frozen=True)

@@ -251,7 +251,7 @@ class Linear:
     """A measurement linearised at one unit with its effects, padding included.
 
     conditions (n,); slope (n, p) by the free numbers of gain and bias, in typical sizes; columns (n, q) by those of the
-    effects, in their own units; names: of both, and sizes (p + q) their typical sizes. details: as in `About`.
+    effects, in their own units; names: of both, and sizes (p + q) their typical sizes. details, unknown: as in `About`.
     """
 
     conditions: FloatArray
@@ -261,6 +261,7 @@ class Linear:
     names: tuple[Name, ...]
     sizes: FloatArray
     details: Any
+    unknown: FloatArray | None = None
 
 
 def linearise(imu: Imu, measurement: Data, free: Callable[[Name], bool]) -> Linear:
@@ -284,6 +285,7 @@ def linearise(imu: Imu, measurement: Data, free: Callable[[Name], bool]) -> Line
         (*parameters.names, *names),
         np.concatenate([np.asarray(parameters.size), sizes]),
         about.details,
+        about.unknown,
     )
 
 
