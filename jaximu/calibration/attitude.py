@@ -25,7 +25,7 @@ from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.tracing import on_host
-from jaximu.ground.vectors import dot_rows, lengths_of, sigmas_of, submatrix
+from jaximu.ground.vectors import column_lengths, dot_rows, lengths_of, sigmas_of, submatrix
 from jaximu.mistakes import prepared
 from jaximu.model.effects import Effect
 from jaximu.model.effects.reference_delay import SetupReferenceDelay
@@ -353,9 +353,7 @@ def _right_handed(recording: Recording, start: _Start) -> Attitude:
     felt = stood.apply(parts).reshape(len(inner), -1, 3).sum(axis=1)
     gained = np.diff(velocity[rows], axis=0)
     felt, gained = (vectors - vectors.mean(axis=0) for vectors in (felt, gained))
-    alike = np.sum(felt * gained, axis=0) / np.maximum(
-        np.linalg.norm(felt, axis=0) * np.linalg.norm(gained, axis=0), 1e-300
-    )
+    alike = np.sum(felt * gained, axis=0) / np.maximum(column_lengths(felt) * column_lengths(gained), 1e-300)
     signs = np.where(alike < -max(_AGAINST, _CHANCE / np.sqrt(len(inner))), -1.0, 1.0)
     if (signs > 0).all():
         return attitude

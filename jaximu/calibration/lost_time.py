@@ -213,7 +213,7 @@ class _Recorded:
         )[real]
         missed = missed_by_sampling(self.turns, gyroscope, about.running)[real]
         self.turned = _Turned(
-            self.projector[np.ix_(rows.ravel(), rows.ravel())],
+            submatrix(self.projector, rows.ravel()),
             (self.projector @ self.residual)[rows.ravel()],
             real,
             turned[rows[:, :, None], rows[:, None, :]],

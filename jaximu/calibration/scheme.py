@@ -14,7 +14,7 @@ import numpy as np
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
-from jaximu.ground.vectors import dot_rows, lengths_of
+from jaximu.ground.vectors import column_lengths, dot_rows, lengths_of
 from jaximu.recordings.observations import Stations
 
 _OPEN = 1e-6  # singular value, as a share of the largest, below which nothing is determined
@@ -62,7 +62,7 @@ def _scheme(triad: str, inputs: FloatArray) -> Scheme:
     values, right = _spectrum(design)
     rank = int(np.sum(values > _OPEN * values[0]))
     condition = float(values[0] / values[rank - 1]) if rank else np.inf
-    share = np.linalg.norm(right[rank:], axis=0)
+    share = column_lengths(right[rank:])
     open_columns = [k for k in range(4) if share[k] > 1e-3]
     undetermined = tuple(
         Name(triad, "gain", (row, k)) if k < 3 else Name(triad, "bias", (row,))

@@ -14,6 +14,7 @@ from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.ground.gravity import STANDARD
 from jaximu.ground.quantities import Z95, listed, sentence, with_interval
+from jaximu.ground.vectors import lengths_of
 
 if TYPE_CHECKING:
     from jaximu.ground.array_types import BoolArray, FloatArray
@@ -230,7 +231,7 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
     from jaximu.recordings.recording import plausibility
 
     signals, poses = recording.signals, 0
-    force = np.linalg.norm(recording.accelerometer.si(), axis=1)
+    force = lengths_of(recording.accelerometer.si())
     timeless = any("stamps from --rate" in note for note in recording.notes)
     near = bool(np.all(np.abs(force / STANDARD.value - 1) < _NEAR_GRAVITY))
     means = timeless and physical and len(force) <= _TABLE and near
@@ -294,9 +295,9 @@ def _at_rest(recording: Recording, repaired: Recording, findings: list[str]) -> 
         f"{' and '.join(limits)} rms)"
     )
     rates = rates[still] if recording.gyroscope is not None and recording.gyroscope.unit != "count" else rates[:0]
-    size = np.linalg.norm(rates, axis=1)
+    size = lengths_of(rates)
     if len(rates) >= _PARTS and size.min() < _BIAS:  # a table's steady turn looks like a rest: the slowest is one
-        near = np.linalg.norm(rates - rates[np.argmin(size)], axis=1) < _STILL["gyroscope"][0]
+        near = lengths_of(rates - rates[np.argmin(size)]) < _STILL["gyroscope"][0]
         findings += [_offset(rates[near])] if near.sum() >= _PARTS else []
     return length, rest, longest, float(start + first)
 
@@ -395,8 +396,8 @@ def _still_seconds(recording: Recording) -> tuple[float, BoolArray, FloatArray]:
         mean, variance, count = Moments(signal).between(begins, begins + 1)
         still &= (np.sqrt(variance.sum(axis=1)) < limit) & (count > 1)
         if signal is recording.accelerometer:
-            still[1:] &= np.linalg.norm(np.diff(mean, axis=0), axis=1) < _MIDDLE
+            still[1:] &= lengths_of(np.diff(mean, axis=0)) < _MIDDLE
         if len(sensors) == 1 and signal is recording.gyroscope:  # a table's steady turn scatters as little
-            still &= np.linalg.norm(mean, axis=1) < _BIAS
+            still &= lengths_of(mean) < _BIAS
         rates = mean if signal is recording.gyroscope else rates
     return float(start), still, rates

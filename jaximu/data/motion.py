@@ -62,7 +62,7 @@ from jaximu.ground.rotation import (
     unit_vectors,
 )
 from jaximu.ground.tracing import array_module, padded_size, part_of
-from jaximu.ground.vectors import sigmas_of
+from jaximu.ground.vectors import lengths_of, sigmas_of
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.mounting import MOUNTING_EFFECTS, Mounting
 from jaximu.model.noise_model import NoiseModel
@@ -567,7 +567,7 @@ class _Pieces:
         still: float,
     ) -> _Pieces:
         """Return the intervals between and in rests, first and last sample (P, 2)."""
-        time, unseen = gyroscope.time, lost * np.linalg.norm(gyroscope.si(), axis=1)
+        time, unseen = gyroscope.time, lost * lengths_of(gyroscope.si())
         pieces, skipped, jumped, bridged = [], 0.0, 0, lost[rests[0, 0] : rests[-1, 1]].sum()
         moved_from = None
         for start, stop in rests.tolist():

@@ -426,7 +426,7 @@ def pose_rows(imu: Imu, observations: Observations) -> Rows:
         return np.concatenate([of_poses, np.repeat(of_turns, 2, axis=0), np.repeat(of_poses, 3, axis=0)])
 
     unknown = np.full(len(pose), np.nan), np.full(len(turn), np.nan)
-    speed = np.degrees(np.linalg.norm(gyroscope.recover_on_host(turns.output), axis=2)) * (turns.interval > 0)
+    speed = np.degrees(lengths_of(gyroscope.recover_on_host(turns.output))) * (turns.interval > 0)
     middle = (poses.start + poses.stop) / 2, (poses.stop[:-1] + poses.start[1:]) / 2
     covariates = {TIME: placed(*middle), TEMPERATURE: placed(poses.temperature, unknown[1])}
     forces = imu.accelerometer.recover_on_host(poses.accelerometer_mean)

@@ -17,6 +17,7 @@ from jaximu.ground.differences import midpoints
 from jaximu.ground.distributions import robust_sigma
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import sentence
+from jaximu.ground.vectors import column_lengths, lengths_of
 from jaximu.mistakes import prepared
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.processes import RATIO, correlation_times
@@ -388,7 +389,7 @@ def _cut(recording: Recording, block: float) -> RestBlocks:
         means[name] = mean
     keep = np.flatnonzero(good & ~moved)
     means = {name: values[keep] for name, values in means.items()}
-    jumps = np.linalg.norm(np.diff(means["accelerometer"], axis=0), axis=1) > _TURNED
+    jumps = lengths_of(np.diff(means["accelerometer"], axis=0)) > _TURNED
     celsius = _cells(temperature, edges)
     slope = smoothed_slope(temperature.time, temperature.values[:, 0], TEMPERATURE_WINDOW)
     slope = np.interp(time, temperature.time, slope)
@@ -518,7 +519,7 @@ def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
     longest = 4 * max(blocks.spans)
     times = correlation_times(shortest, longest)
     indicator = np.eye(blocks.levels)[blocks.level]
-    taken = np.concatenate([indicator, smooth / np.maximum(np.linalg.norm(smooth, axis=0), 1e-300)], axis=1)
+    taken = np.concatenate([indicator, smooth / np.maximum(column_lengths(smooth), 1e-300)], axis=1)
     null = scipy.linalg.null_space(taken.T, rcond=1e-9)
     if not null.shape[1]:
         raise NotPossibleError(

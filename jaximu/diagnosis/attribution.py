@@ -38,6 +38,7 @@ from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.page import Result
 from jaximu.ground.quantities import counted, listed
 from jaximu.ground.units import SENSOR_UNITS
+from jaximu.ground.vectors import column_lengths, root_or_zero
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE
 from jaximu.recordings.recording import Recording, recordings_of
@@ -189,7 +190,7 @@ class BoardRecording:
         columns = evidence.columns[:, evidence.place(block)]
         basis = orthonormal(np.concatenate(others, axis=1))
         u, s, v = np.linalg.svd(off(basis, columns), full_matrices=False)
-        kept = s > BLIND * np.max(np.linalg.norm(columns, axis=0), initial=1e-300)
+        kept = s > BLIND * np.max(column_lengths(columns), initial=1e-300)
         return u[:, kept].T @ evidence.residual, s[kept, None] * v[kept]
 
     def known(
@@ -200,7 +201,7 @@ class BoardRecording:
         if block is not None:
             question = self.evidence.blocks[block]
             values, vectors = np.linalg.eigh(covariance)
-            root = question.sizes[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+            root = question.sizes[:, None] * vectors * root_or_zero(values)
             yield KnownEffect(CATALOGUE[name].make(mean * question.sizes, **question.inner), root)
 
 
@@ -376,7 +377,7 @@ class CommonDrift:
         curve = np.interp(rests.times, self.times, self.curve)[:, None]
         questions = [rests.columns(triad, curve) for triad in TRIADS]
         columns = off_base(np.concatenate([*questions, rests.columns("gyroscope", rests.up)], axis=1))
-        size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+        size = np.maximum(column_lengths(columns), 1e-300)
         amounts = np.linalg.lstsq(columns / size, part.evidence.residual, rcond=BLIND)[0] / size
         changed = {}
         for triad, amount in zip(TRIADS, amounts[:6].reshape(2, 3), strict=True):

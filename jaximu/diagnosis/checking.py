@@ -34,7 +34,7 @@ from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed, size
 from jaximu.ground.units import STANDARD_GRAVITY
-from jaximu.ground.vectors import sigmas_of
+from jaximu.ground.vectors import lengths_of, sigmas_of, submatrix
 from jaximu.mistakes import prepared
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import NoiseModel
@@ -243,7 +243,7 @@ def _validity(
     """Return the answer to a question; `about`: what else a `Validity` says."""
     shifts = _shifts(old, fresh, 0.0 if verdict == "valid" else level)
     compared = [k for k, shift in enumerate(shifts) if shift.tested]
-    difference, spread = fresh.difference[compared], fresh.covariance_of_difference[np.ix_(compared, compared)]
+    difference, spread = fresh.difference[compared], submatrix(fresh.covariance_of_difference, compared)
     square = float(difference @ np.linalg.solve(spread, difference))
     residual = question.evidence.residual
     return Validity(
@@ -283,7 +283,7 @@ def _followed(
     known = [k for k, name in enumerate(calibration.names) if name.effect is None and name in old.names]
     places = [old.names.index(calibration.names[k]) for k in known]
     covariance = np.array(calibration.covariance)
-    covariance[np.ix_(known, known)] = old.covariance[np.ix_(places, places)]
+    covariance[np.ix_(known, known)] = submatrix(old.covariance, places)
     covariance += _ROUNDING * np.diag(np.diagonal(covariance))  # it stays positive definite without gravity's share
     follower = FilterInUse(
         replace(calibration, covariance=covariance),
@@ -354,9 +354,9 @@ def _told(follower: FilterInUse, old: Old, updates: int) -> tuple[FollowedUnit, 
     pull = information @ follower.change
     kept = [k for k, name in enumerate(names) if name.effect is None and name in old.names]
     beside = [k for k in range(len(pull)) if k not in kept]
-    alone = information[np.ix_(kept, kept)] - prior[np.ix_(kept, kept)]
+    alone = submatrix(information, kept) - submatrix(prior, kept)
     across = information[np.ix_(kept, beside)]
-    away = np.linalg.solve(information[np.ix_(beside, beside)], np.column_stack([across.T, pull[beside]]))
+    away = np.linalg.solve(submatrix(information, beside), np.column_stack([across.T, pull[beside]]))
     alone, pull = alone - across @ away[:, :-1], pull[kept] - across @ away[:, -1]
     places = [old.names.index(names[k]) for k in kept]
     size = old.sizes[places]
@@ -374,7 +374,7 @@ def _beforehand(follower: FilterInUse, old: Old, kept: list[int], places: list[i
     """Return the covariance (p, p) of the old numbers as the filter began with it."""
     covariance = np.zeros((len(old.names), len(old.names)))
     inverse = np.linalg.inv(follower.prior)
-    covariance[np.ix_(places, places)] = (inverse @ inverse.T)[np.ix_(kept, kept)]
+    covariance[np.ix_(places, places)] = submatrix(inverse @ inverse.T, kept)
     return covariance
 
 
@@ -390,7 +390,7 @@ def _upright(old: Old, recording: Recording, history: History, gravity: LocalGra
     """Raise `InputError` where gravity is far off in rests, which no calibration's age makes."""
     signal = recording.accelerometer
     force = np.asarray(old.imu.with_effects().accelerometer.recover(signal.values))
-    size = np.linalg.norm(interpolated(signal.time, force, history.time[history.rest] - INTERVAL / 2), axis=1)
+    size = lengths_of(interpolated(signal.time, force, history.time[history.rest] - INTERVAL / 2))
     off = float(np.median(np.abs(size - gravity.value)))
     if off > _FAR_OFF[0]:
         raise InputError(
@@ -426,7 +426,7 @@ def _same_unit(experiment: Experiment, conditions: FloatArray, name: str, unlike
     real = experiment.real
     for index, (kind, limit) in enumerate(zip(real.kinds, _FAR_OFF, strict=False)):
         vectors = (conditions * real.to_si)[real.kind == index].reshape(-1, kind.components)
-        if len(vectors) and (median := float(np.median(np.linalg.norm(vectors, axis=1)))) > limit:
+        if len(vectors) and (median := float(np.median(lengths_of(vectors)))) > limit:
             raise InputError(
                 f"{name}: with this calibration the {kind.name.replace('_', ' ')} is off by "
                 f"{size(kind.factor * median, kind.unit)} in the median: is it the same unit, in the same units and "
@@ -545,7 +545,7 @@ def _output_errors(old: Old, fresh: Fresh, data: Data) -> dict[str, OutputError]
     errors = {}
 
     def error(value: float, slope: FloatArray, places: list[int], unit: str) -> OutputError:
-        spread = slope @ fresh.covariance_of_difference[np.ix_(places, places)] @ slope.T
+        spread = slope @ submatrix(fresh.covariance_of_difference, places) @ slope.T
         return OutputError(value, float(np.sqrt(np.trace(spread))), unit)
 
     for name, unit in (("accelerometer", "m/s^2"), ("gyroscope", "rad/s")):
@@ -554,7 +554,7 @@ def _output_errors(old: Old, fresh: Fresh, data: Data) -> dict[str, OutputError]
         values = np.concatenate([recording.signals[name].values for recording in data.recordings])
         true = (values - after.bias) @ np.linalg.inv(after.gain).T
         output = (values - (after if name == "gyroscope" else before).bias) @ inverse.T
-        size = np.linalg.norm(output - true, axis=1)
+        size = lengths_of(output - true)
         worst = int(np.argmax(size))
         axes = [old.names[k].axes for k in places]  # (output, input) of a gain, (output,) of a bias
         columns = [inverse[:, entry[0]] * np.prod([true[worst, k] for k in entry[1:]]) for entry in axes]
@@ -566,7 +566,7 @@ def _output_errors(old: Old, fresh: Fresh, data: Data) -> dict[str, OutputError]
         by = np.degrees(by[..., :3] - by[..., 3:] * np.asarray(after.bias))
         inverse = np.linalg.inv(before.gain)
         vectors = np.einsum("tijk,jk->ti", by, np.linalg.inv(after.gain) - inverse)
-        worst = int(np.argmax(np.linalg.norm(vectors, axis=1)))
+        worst = int(np.argmax(lengths_of(vectors)))
         slope = -np.einsum("ijk,ja,bk->iab", by[worst], inverse, inverse).reshape(3, 9)
         errors["turns"] = error(float(np.linalg.norm(vectors[worst])), slope, old.places("gyroscope", "gain"), "deg")
     return errors

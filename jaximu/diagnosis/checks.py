@@ -13,6 +13,7 @@ from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf, holm, kolmogorov_sf
 from jaximu.ground.document import Json, entries
+from jaximu.ground.vectors import submatrix
 
 _KINDS = {
     "gravity_norm": ("gravity norm at rest", "the magnitude of the specific force in the poses"),
@@ -79,7 +80,7 @@ def _by_kind(state: State, experiment: Experiment) -> list[Check]:
         rows = experiment.real.kind == index
         if not rows.any():
             continue
-        values, vectors = np.linalg.eigh(left[np.ix_(rows, rows)])
+        values, vectors = np.linalg.eigh(submatrix(left, rows))
         keep = values > 1e-9 * values[-1]
         along = vectors[:, keep].T @ residual[rows] / np.sqrt(values[keep])
         statistic, freedom = float(along @ along), int(keep.sum())
@@ -171,7 +172,7 @@ def _odd_even(state: State, experiment: Experiment) -> Check:
 
     def misfit(rows) -> tuple[float, int]:
         """χ² of some conditions by themselves, and its degrees of freedom."""
-        white = np.linalg.cholesky(covariance[np.ix_(rows, rows)])
+        white = np.linalg.cholesky(submatrix(covariance, rows))
         basis, values, _ = np.linalg.svd(np.linalg.solve(white, jacobian[rows]), full_matrices=False)
         basis = basis[:, values > 1e-8 * values[0]]
         error = np.linalg.solve(white, state.conditions[rows])

@@ -19,7 +19,7 @@ from jaximu.estimation.uncertainty import label
 from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import LocalGravity
-from jaximu.ground.vectors import sigmas_of
+from jaximu.ground.vectors import sigmas_of, submatrix
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
 
@@ -75,7 +75,7 @@ class Old:
                 "may sit turned. Check a calibration that was made in the set-up."
             )
         covariance = np.zeros((len(names), len(names)))
-        covariance[np.ix_(there, there)] = calibration.covariance[np.ix_(columns, columns)]
+        covariance[np.ix_(there, there)] = submatrix(calibration.covariance, columns)
         of_effects = 10 * np.maximum(np.maximum(np.abs(values), sigmas_of(covariance)), 1e-12)
         sizes = np.concatenate([np.asarray(parameters.size), of_effects[len(parameters.names) :]])
         scales, units = np.ones(len(names)), []
@@ -250,7 +250,7 @@ def scatter_about_a_fit(old: Old, experiment: Experiment, fresh: Fresh) -> Float
         fresh = fresh if number == 0 else Fresh.fit(old, experiment, scatter, begin=fresh.imu)
         for kind in np.unique(experiment.real.kind):
             rows = experiment.real.kind == kind
-            values, vectors = np.linalg.eigh(fresh.left[np.ix_(rows, rows)])
+            values, vectors = np.linalg.eigh(submatrix(fresh.left, rows))
             keep = values > 1e-6 * values[-1]
             along = vectors[:, keep].T @ fresh.conditions[rows] / np.sqrt(values[keep])
             scatter[kind] = max(1.0, scatter[kind] * np.sqrt(float(along @ along) / keep.sum()))
@@ -311,7 +311,7 @@ class Question:
         """
         conditions, columns, whole = predicted
         tested = old.tested
-        whole = whole + columns[:, tested] @ old.covariance[np.ix_(tested, tested)] @ columns[:, tested].T
+        whole = whole + columns[:, tested] @ submatrix(old.covariance, tested) @ columns[:, tested].T
         by_gravity = columns @ old.gravity
         whole += old.own**2 * by_gravity[:, None] * by_gravity
         weights = np.linalg.inv(np.linalg.cholesky(whole))

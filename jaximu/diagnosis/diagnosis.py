@@ -39,6 +39,7 @@ from jaximu.ground.errors import InputError, NotPossibleError, nearest
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.page import Result
 from jaximu.ground.quantities import Z95, change, listed, probability, sentence, size, with_interval, with_intervals
+from jaximu.ground.vectors import column_lengths, lengths_of, root_or_zero, submatrix
 from jaximu.mistakes import prepare, prepared
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect, register
@@ -329,7 +330,7 @@ def extended(calibration: Calibration, experiment: Experiment, state: State, noi
     jacobian, used = np.concatenate([slope, columns], axis=1)[:, places], experiment.used
     by_conditions = np.zeros(jacobian.T.shape)
     total = np.asarray(fitted.covariance, np.float64)
-    by_conditions[:, used] = -total @ np.linalg.solve(linear.covariance[np.ix_(used, used)], jacobian[used]).T
+    by_conditions[:, used] = -total @ np.linalg.solve(submatrix(linear.covariance, used), jacobian[used]).T
     total, sigmas = about_biases(fitted.names, total, by_conditions, means, noise)
     fitted = replace(fitted, covariance=total)
     return replace(
@@ -943,7 +944,7 @@ def same_device(first: Calibration, other: Calibration) -> list[str]:
     notes = []
     for name, triad in first.triads().items():
         gains = [np.asarray(gain) for gain in (triad.gain, other.triads()[name].gain)]
-        jump = float(np.max(np.abs(gains[0] - gains[1])) / np.mean(np.linalg.norm(gains[0], axis=1)))
+        jump = float(np.max(np.abs(gains[0] - gains[1])) / np.mean(lengths_of(gains[0])))
         if jump > _OTHER_UNIT:
             notes.append(
                 f"the held-out recording's {name} gain differs by {100 * jump:.2g} %: is it the same unit, in the same "
@@ -955,14 +956,14 @@ def same_device(first: Calibration, other: Calibration) -> list[str]:
 def _saturated(experiment: Experiment, state: State) -> list[ResidualKind]:
     """Return the kinds of conditions of which the parameters leave none over."""
     jacobian = np.linalg.solve(state.weights, state.evidence.jacobian)
-    jacobian /= np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+    jacobian /= np.maximum(column_lengths(jacobian), 1e-300)
     parts = [(kind, jacobian[experiment.real.kind == k]) for k, kind in enumerate(experiment.real.kinds)]
     return [kind for kind, part in parts if len(part) and np.linalg.matrix_rank(part, 1e-6) == len(part)]
 
 
 def _named(experiment: Experiment, state: State, entry: Found, gain: Gain | None) -> Named:
     (effect,) = (fitted for fitted in state.effects if fitted.name == entry.name)
-    sigma = np.sqrt(np.maximum(np.diag(state.covariance), 0.0))
+    sigma = root_or_zero(np.diag(state.covariance))
     places = state.places(entry.name)
     inner = {name: float(sigma[index]) for name in effect.inner for index in state.places(entry.name, name)}
     triads, largest = state.imu.triads(), experiment.largest(state, effect)

@@ -25,7 +25,7 @@ from jaximu.estimation.data import Data, Handling
 from jaximu.estimation.fitting import Linear
 from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.ground.array_types import BoolArray, FloatArray
-from jaximu.ground.vectors import sigmas_of
+from jaximu.ground.vectors import sigmas_of, submatrix
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 
@@ -154,7 +154,7 @@ def estimate_drift(
     log_size, uncertainty = restricted_likelihood(
         linear.conditions[used],
         np.concatenate([linear.slope[used], columns], axis=1),
-        linear.covariance[np.ix_(used, used)],
+        submatrix(linear.covariance, used),
         components[:, used][:, :, used],
         mean,
         spread,

@@ -20,7 +20,7 @@ from jaximu.diagnosis.drift import DRAWS
 from jaximu.estimation.leave_out import off
 from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.distributions import chi2_isf, chi2_sf, noncentral_chi2_sf
-from jaximu.ground.vectors import sigmas_of
+from jaximu.ground.vectors import column_lengths, root_or_zero, sigmas_of, submatrix
 
 BLIND = 1e-4
 """Share of an effect's reach that the base parameters must leave of it; below, it is not observable."""
@@ -113,7 +113,7 @@ class Evidence:
         )
         self._edges = np.cumsum([0, *(block.columns.shape[1] for block in blocks)])
         self.columns = self.off_base(raw[0])
-        self._reach = np.linalg.norm(raw[0], axis=0)
+        self._reach = column_lengths(raw[0])
         self._gram = self.columns.T @ self.columns
         self._product = self.columns.T @ self.residual
 
@@ -163,7 +163,7 @@ class Evidence:
         """
         inside = self.span(blocks)
         sizes = np.concatenate([self.blocks[k].sizes for k in blocks])
-        gram = self._gram[np.ix_(inside, inside)] / sizes[:, None] / sizes
+        gram = submatrix(self._gram, inside) / sizes[:, None] / sizes
         return detection_limit(gram, self._reach[inside] / sizes, len(blocks), self.critical(FAMILY_LEVEL))
 
     @cached_property
@@ -179,7 +179,7 @@ class Evidence:
     def scores(self, known: Sequence[int] = ()) -> Scores:
         """Return every block's score, those `known` taken into the model beforehand."""
         inside = self.span(known)
-        root, _ = _roots(self._gram[np.ix_(inside, inside)][None], self._reach[inside][None])
+        root, _ = _roots(submatrix(self._gram, inside)[None], self._reach[inside][None])
         across = self._gram[:, inside] @ root[0]
         product = self._product - across @ (root[0].T @ self._product[inside])
         outside = self._outside(known)
@@ -279,7 +279,7 @@ class Evidence:
     def coefficients(self, blocks: Sequence[int]) -> FloatArray:
         """Return the least-squares coefficients of the blocks' columns together, in units of their sizes."""
         inside = self.span(blocks)
-        root, _ = _roots(self._gram[np.ix_(inside, inside)][None], self._reach[inside][None])
+        root, _ = _roots(submatrix(self._gram, inside)[None], self._reach[inside][None])
         return root[0] @ (root[0].T @ self._product[inside])
 
     def most_likely(self, blocks: Sequence[int]) -> tuple[FloatArray, FloatArray]:
@@ -289,7 +289,7 @@ class Evidence:
         anywhere: a lag that all axes have in common moves nothing to first order.
         """
         inside = self.span(blocks)
-        known = self._gram[np.ix_(inside, inside)] + np.eye(len(inside)) / _LARGE**2
+        known = submatrix(self._gram, inside) + np.eye(len(inside)) / _LARGE**2
         covariance = np.asarray(np.linalg.inv(known), np.float64)
         return covariance @ self._product[inside], covariance
 
@@ -379,7 +379,7 @@ def _grid_limit(gram: FloatArray, lengths: FloatArray, places: int, level: float
     bound = np.where(rank > 0, chi2_isf(level, np.maximum(rank, 1)), np.inf)
     values, vectors = np.linalg.eigh(gram)
     # the symmetric root: the signs of eigenvectors, which are anybody's, do not change the draws
-    noise = random.standard_normal((_DRAWN, len(gram))) @ (vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T)
+    noise = random.standard_normal((_DRAWN, len(gram))) @ (vectors * root_or_zero(values) @ vectors.T)
     direction = random.standard_normal((_DRAWN, columns.shape[1]))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     signal = np.concatenate([direction[k::places] @ gram[columns[k]] for k in range(places)])

@@ -24,6 +24,7 @@ from jaximu.estimation.track import added
 from jaximu.ground.array_types import Array, BoolArray, FloatArray
 from jaximu.ground.document import Json
 from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.vectors import submatrix
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.base import Extent, Kind
 from jaximu.model.noise_model import NoiseModel
@@ -366,7 +367,7 @@ class Experiment(Data):
         places = [linear.names.index(name) for name in fitted.names]
         covariance[np.ix_(places, places)] = fitted.covariance
         weights = scipy.linalg.solve_triangular(
-            np.linalg.cholesky(linear.covariance[np.ix_(used, used)]), np.eye(int(used.sum())), lower=True
+            np.linalg.cholesky(submatrix(linear.covariance, used)), np.eye(int(used.sum())), lower=True
         )
         columns = np.concatenate([linear.slope, linear.columns * linear.sizes[linear.slope.shape[1] :]], axis=1)
         jacobian = weights @ columns[np.ix_(used, np.sort(places))]
@@ -425,7 +426,7 @@ class Experiment(Data):
         """
         linear, used = self.linearise(imu), self.used
         columns = np.concatenate([linear.slope / linear.sizes[: linear.slope.shape[1]], linear.columns], axis=1)
-        return linear.conditions[used], columns[used], linear.covariance[np.ix_(used, used)], linear.names
+        return linear.conditions[used], columns[used], submatrix(linear.covariance, used), linear.names
 
     def _blocks(
         self, imu: Imu, linear: Linear, weights: FloatArray, fitted: set[str], asking: Container[str] | None

@@ -19,6 +19,7 @@ from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.document import Json
 from jaximu.ground.quantities import change
+from jaximu.ground.vectors import root_or_zero, submatrix
 from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import POWER_ON
@@ -101,7 +102,7 @@ def _predict(held: Experiment, state: State) -> Prediction:
     conditions, columns, covariance, names = held.predict(imu)
     labels = [describe(name, state.model) for name in state.names]
     places = [labels.index(describe(name, imu)) for name in names]
-    spread = np.array(state.covariance[np.ix_(places, places)])
+    spread = np.array(submatrix(state.covariance, places))
     for name, size in POWER_ON.items():
         if bias := _biases(names, name):
             spread[bias, bias] += (size * imu.triads()[name].scales) ** 2
@@ -136,7 +137,7 @@ def _beside_open(
     root = np.linalg.cholesky(covariance)
     white = np.linalg.solve(root, conditions)
     moved, sizes, _ = np.linalg.svd(
-        np.linalg.solve(root, columns @ (vectors * np.sqrt(np.maximum(values, 0.0)))), full_matrices=False
+        np.linalg.solve(root, columns @ (vectors * root_or_zero(values))), full_matrices=False
     )
     along = moved.T @ white
     chi_squared = float(np.sum((white - moved @ along) ** 2) + np.sum(along**2 / (1 + sizes**2)))

@@ -25,6 +25,7 @@ from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.document import Json
 from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.vectors import submatrix
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import Learned as Curve
 
@@ -250,7 +251,7 @@ class _Parts:
         errors = np.zeros(len(evidence.residual))
         for part, scored in self.parts:
             error, covariance = part.beside(pull[part.rows], step)
-            root = np.linalg.cholesky(covariance[np.ix_(scored, scored)])
+            root = np.linalg.cholesky(submatrix(covariance, scored))
             errors[part.rows[scored]] = error[scored]
             squared += float(np.sum(solve_triangular(root, error[scored], lower=True) ** 2))
             count += len(root)
@@ -283,7 +284,7 @@ def _curve(state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
     x = np.linspace(low, high, _POINTS)
     shapes = np.asarray(effect.shapes(x))
     places = state.places(effect.name)
-    known = state.covariance[np.ix_(places, places)]
+    known = submatrix(state.covariance, places)
     count = shapes.shape[1]
     y = shapes @ np.asarray(effect.coefficients).reshape(3, count).T / scale
     blocks = [known[a : a + count, a : a + count] for a in range(0, 3 * count, count)]

@@ -23,6 +23,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
+from jaximu.ground.vectors import column_lengths, lengths_of, submatrix
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.base import Extent
@@ -120,7 +121,7 @@ def diagnose_magnetometer(calibration: Calibration, measurement: MagneticField) 
     about = measurement.about(jax.tree.map(lambda leaf: leaf[None], model))
     covariance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.covariance)
     rows = covariance.used > 0
-    total = np.asarray(covariance.total(np.asarray(fit.excess)))[np.ix_(rows, rows)]
+    total = submatrix(np.asarray(covariance.total(np.asarray(fit.excess))), rows)
     weights = np.asarray(np.linalg.inv(np.linalg.cholesky(total)), np.float64)
     columns = np.concatenate([linear.slope, linear.columns * linear.sizes[linear.slope.shape[1] :]], axis=1)
     residual, jacobian = weights @ linear.conditions[rows], weights @ columns[rows]
@@ -235,7 +236,7 @@ def check_magnetometer(old: Calibration, new: Calibration) -> MagneticShift:
     for calibration, triad, scale in zip((old, new), triads, (1.0, factor), strict=True):
         rows = [calibration.names.index(name) for name in names]
         size = np.array([scale if name.part == "gain" else 1.0 for name in names])
-        spreads.append(calibration.covariance[np.ix_(rows, rows)] * size * size[:, None])
+        spreads.append(submatrix(calibration.covariance, rows) * size * size[:, None])
         values.append(size * np.array([np.asarray(getattr(triad, name.part))[name.axes] for name in names]))
     shift, spread = values[1] - values[0], spreads[0] + spreads[1]
     # along the common factor nothing can be told
@@ -245,7 +246,7 @@ def check_magnetometer(old: Calibration, new: Calibration) -> MagneticShift:
     left, root = basis.T @ shift, np.linalg.cholesky(basis.T @ spread @ basis)
     statistic = float(np.sum(np.linalg.solve(root, left) ** 2))
     iron = [k for k, name in enumerate(names) if name.part == "bias"]
-    scale = float(np.mean(np.linalg.norm(gains[0], axis=1)))
+    scale = float(np.mean(lengths_of(gains[0])))
     return MagneticShift(
         statistic,
         len(left),
@@ -310,7 +311,7 @@ def _left_out(weights: FloatArray, columns: FloatArray, residual: FloatArray, re
     """Return log-likelihood and rms errors of fifths, each predicted from all the rest."""
     parts = [real.touching(part) for part in real.parts(_FOLDS)]
     likelihood, errors = 0.0, np.zeros(len(residual))
-    size = 1 / np.linalg.norm(weights, axis=0)  # rows are in µT and sines: what is blind is told in units of their own
+    size = 1 / column_lengths(weights)  # rows are in µT and sines: what is blind is told in units of their own
     for part in leave_out(weights * size, columns, residual, parts):
         likelihood += part.log_likelihood()
         errors[part.rows] = size[part.rows] * part.errors

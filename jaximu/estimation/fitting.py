@@ -34,7 +34,7 @@ from jaximu.ground.differences import value_and_jacobian
 from jaximu.ground.errors import InputError, one_of
 from jaximu.ground.precision import require_float64
 from jaximu.ground.tracing import array_module, first, is_traced, lifted, part_of
-from jaximu.ground.vectors import sigmas_of
+from jaximu.ground.vectors import sigmas_of, submatrix
 from jaximu.model.effects.base import inner_owners
 from jaximu.model.sensor import Imu
 
@@ -182,7 +182,7 @@ def informed(fitted: Fit, prior: Prior) -> Fit:
     rows = [fitted.names.index(name) for name in prior.names]
     covariance, values = np.asarray(fitted.covariance), np.asarray(fitted.values)
     known = np.linalg.inv(prior.root.T @ prior.root)
-    share = covariance[:, rows] @ np.linalg.inv(covariance[np.ix_(rows, rows)] + known)
+    share = covariance[:, rows] @ np.linalg.inv(submatrix(covariance, rows) + known)
     keep = np.eye(len(values))
     keep[:, rows] -= share
     moved = values + share @ (prior.mean - values[rows])

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space, solve_triangular
 
 from jaximu.ground.array_types import BoolArray, FloatArray
+from jaximu.ground.vectors import column_lengths, submatrix
 
 _RANK = 1e-9
 """Share of the largest singular value below which a combination of columns is none."""
@@ -60,7 +61,7 @@ class LeftOut(NamedTuple):
         known = np.eye(int(some.sum()))
         if self.blind and some.any():
             known = null_space(null_space(self.directions.T)[some].T, rcond=_BLIND)
-        values, vectors = np.linalg.eigh(known.T @ self.covariance[np.ix_(some, some)] @ known)
+        values, vectors = np.linalg.eigh(known.T @ submatrix(self.covariance, some) @ known)
         return LeftOut(self.rows[some], self.errors[some], 1 / values, known @ vectors, self.numbers)
 
     def beside(self, pull: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -86,7 +87,7 @@ def leave_out(
     **Arguments:** `weights` W (n, n): W C Wᵀ = I. `columns` (n + k, p) and `target` (n + k,): W X and W y, and below
     them k rows for what is known of the numbers beforehand. `parts`: of the n rows, by place or as masks (n,).
     """
-    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    size = np.maximum(column_lengths(columns), 1e-300)
     u, s, v = np.linalg.svd(columns / size, full_matrices=False)
     kept = s > _RANK * s[:1].max(initial=0.0)
     basis, count = u[:, kept], len(weights)
@@ -119,7 +120,7 @@ def orthonormal(columns: FloatArray) -> FloatArray:
     """Return orthonormal columns of what columns (n, k) span."""
     if not columns.shape[1]:
         return columns
-    u, s, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
+    u, s, _ = np.linalg.svd(columns / np.maximum(column_lengths(columns), 1e-300), full_matrices=False)
     return u[:, s > _RANK * s[0]]
 
 

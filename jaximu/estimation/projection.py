@@ -45,7 +45,7 @@ class OutputUncertainty:
     @property
     def largest(self) -> FloatArray:
         """The standard deviation (...) along the direction in which it is largest; infinite if any axis is."""
-        values = np.sqrt(np.maximum(np.linalg.eigvalsh(self.covariance)[..., -1], 0.0))
+        values = root_or_zero(np.linalg.eigvalsh(self.covariance)[..., -1])
         return np.where(np.isinf(self.sigma).any(axis=-1), np.inf, values)
 
 

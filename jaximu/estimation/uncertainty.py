@@ -11,6 +11,7 @@ from jaximu.ground.array_types import Array, FloatArray, IntArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.quantities import counted, listed, number, size
 from jaximu.ground.units import SENSOR_UNITS, STANDARD_GRAVITY
+from jaximu.ground.vectors import column_lengths, lengths_of
 from jaximu.model.sensor import Imu
 
 # Standard deviations along a direction, in typical sizes (10 % of a scale, 1 m/s², 0.1 rad/s).
@@ -54,7 +55,7 @@ def pose_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, mo
     # norm change at gravity direction u: u·(δK u g + δb)
     effect = np.abs(np.einsum("ni,ij,nj->n", _GRID, change * STANDARD_GRAVITY, _GRID) + _GRID @ bias)
     gyro, _ = _in_si(vector, names, sizes, model, "gyroscope")
-    turning = np.linalg.norm(gyro, axis=0)
+    turning = column_lengths(gyro)
     if np.linalg.norm(gyro) > 0.5 * np.linalg.norm(vector) * 0.1:
         axis = "xyz"[int(np.argmax(turning))]
         return f"turns of 90° or more about the {axis} axis, in both directions, with that axis horizontal."
@@ -66,9 +67,9 @@ def pose_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, mo
 def station_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model: Imu) -> str:
     """Say which known poses or turns would excite a direction most."""
     change, bias = _in_si(vector, names, sizes, model, "accelerometer")
-    force = np.linalg.norm(_GRID @ change.T * STANDARD_GRAVITY + bias, axis=1)
+    force = lengths_of(_GRID @ change.T * STANDARD_GRAVITY + bias)
     gyro, drift = _in_si(vector, names, sizes, model, "gyroscope")
-    turning = np.linalg.norm(gyro, axis=0)
+    turning = column_lengths(gyro)
     remedies = []
     if force.max() > 0.1:
         remedies.append(f"a pose with this body direction up: {_strongest(force)}")
@@ -96,7 +97,7 @@ def weak_directions(
     _, values, right = np.linalg.svd(np.asarray(jacobian), full_matrices=jacobian.shape[0] < jacobian.shape[1])
     values = np.pad(values, (0, len(right) - len(values)))  # fewer residuals than parameters
     spread = right / np.hypot(values, 1 / TOLERANCE)[:, None]  # covariance: spread.T @ spread
-    sigmas, variance = np.linalg.norm(spread, axis=1), np.sum(spread**2, axis=0)
+    sigmas, variance = lengths_of(spread), np.sum(spread**2, axis=0)
     known = sigmas <= UNDETERMINED
     basis = _of_few_numbers(right[~known])
     lost = (variance > UNDETERMINED**2) & (np.sum(spread[~known] ** 2, axis=0) > MOSTLY * variance)

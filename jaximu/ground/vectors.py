@@ -6,8 +6,13 @@ from jaximu.ground.array_types import FloatArray
 
 
 def lengths_of(vectors) -> FloatArray:
-    """Return the lengths (n,) of vectors (n, m)."""
-    return np.linalg.norm(vectors, axis=1)
+    """Return the lengths (…,) of vectors (…, m)."""
+    return np.linalg.norm(vectors, axis=-1)
+
+
+def column_lengths(matrix) -> FloatArray:
+    """Return the lengths (n,) of the columns of a matrix (m, n)."""
+    return np.linalg.norm(matrix, axis=0)
 
 
 def dot_rows(one, other) -> FloatArray:

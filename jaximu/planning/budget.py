@@ -67,7 +67,7 @@ from jaximu.ground.array_types import Array, BoolArray, FloatArray
 from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
-from jaximu.ground.vectors import lengths_of, root_or_zero, sigmas_of
+from jaximu.ground.vectors import column_lengths, lengths_of, root_or_zero, sigmas_of
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
 from jaximu.planning.chunks import in_chunks
@@ -279,7 +279,7 @@ def _determined(jacobian: FloatArray, scale: FloatArray, sigma: FloatArray) -> B
     """Which parameters (p,) the scheme determines: what the data sheet's tolerance holds is as uncertain as that."""
     known = np.linalg.inv(jacobian.T @ jacobian + np.eye(len(scale)) / TOLERANCE**2)
     held = scale * lengths_of(known) / TOLERANCE
-    return (sigmas_of(known) <= UNDETERMINED) & (held <= _OFF * np.linalg.norm(sigma, axis=0))
+    return (sigmas_of(known) <= UNDETERMINED) & (held <= _OFF * column_lengths(sigma))
 
 
 def _mean_square(values: FloatArray) -> FloatArray:

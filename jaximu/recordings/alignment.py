@@ -213,7 +213,7 @@ def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatA
     rows = starts[:, None] + np.arange(span)
     turn = interpolated(rate_time, rate - np.median(rate, axis=0), force_time[rows])
     steps = turn * np.gradient(force_time)[rows][:, :, None]
-    turning = np.linalg.norm(steps, axis=2).sum(axis=1) > 0.5
+    turning = lengths_of(steps).sum(axis=1) > 0.5
     if turning.sum() < _CLEAR:
         return False
     rows, steps = rows[turning], steps[turning]

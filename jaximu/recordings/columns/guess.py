@@ -21,6 +21,7 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import listed, unit_text
 from jaximu.ground.units import SENSORS, STANDARD_GRAVITY, Unit, column_title, find_unit, parse_column
 from jaximu.ground.units import unit as unit_named
+from jaximu.ground.vectors import column_lengths, lengths_of
 from jaximu.recordings.alignment import CORRELATED, Turning, turning
 from jaximu.recordings.columns.habits import Field, fields_of, last_of, measures, sensor_of, words_of
 from jaximu.recordings.columns.known import EPOCH
@@ -146,7 +147,7 @@ class _Triad:
         low = np.percentile(scatter, 10)
         every_mean = cut.mean(axis=1)
         means = every_mean[scatter <= max(4 * low, 1e-12)]
-        norm = np.linalg.norm(means, axis=1)
+        norm = lengths_of(means)
         self.level = float(np.median(norm))
         # rms of an axis in its quiet windows
         self.noise = float(np.sqrt(np.median(np.sort(scatter)[: max(1, len(scatter) // 4)]) / 3))
@@ -156,7 +157,7 @@ class _Triad:
         directions = means / np.maximum(norm[:, None], 1e-300)
         self.posed = bool(len(means) > 3 and np.linalg.norm(directions.mean(axis=0)) < 0.9)
         # the norm changes where it moves, as a magnetometer's does not
-        jitter = np.diff(np.linalg.norm(cut, axis=2), axis=1).std(axis=1)
+        jitter = np.diff(lengths_of(cut), axis=1).std(axis=1)
         moving = scatter > 30 * max(low, 1e-12)
         self.lively = bool(moving.sum() > 2 and np.median(jitter[moving]) > 3 * np.median(jitter[~moving]))
         some = self.values[:20000]
@@ -253,7 +254,7 @@ class _Guess:
 
     def _off_unit(self, places: Collection[int]) -> FloatArray:
         """How far the length of the numbers in some columns is off one, by row."""
-        return np.abs(np.linalg.norm([np.asarray(self.numbers[at]) for at in places], axis=0) - 1)
+        return np.abs(column_lengths([np.asarray(self.numbers[at]) for at in places]) - 1)
 
     def _ask(self, text: str, blank: str = "", default: str | None = None, option: str = "columns") -> None:
         self.questions.append(OpenPoint(text, option, blank, default))

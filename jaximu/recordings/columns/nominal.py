@@ -10,6 +10,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.units import unit
+from jaximu.ground.vectors import lengths_of
 from jaximu.recordings.recording import Signal, Stated
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?:/\d+\.?\d*)?"
@@ -78,7 +79,7 @@ def scaled_accelerometer(
     sphere = fit_sphere(means)
     if offset is not None:
         zero = np.array(np.broadcast_to(parse_offset(offset, "--accel-offset"), 3))
-        radius = sphere[1] if sphere else np.median(np.linalg.norm(means - zero, axis=1))
+        radius = sphere[1] if sphere else np.median(lengths_of(means - zero))
     elif sphere:
         zero, radius = sphere
     else:
@@ -154,7 +155,7 @@ def fit_sphere(points: FloatArray) -> tuple[FloatArray, float] | None:
         fitted = miss <= max(4.0 * np.median(miss), 1e-6 * radius)
         solution = np.linalg.lstsq(design[fitted], target[fitted], rcond=None)[0]
         radius = np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 1e-12))
-        miss = np.abs(np.linalg.norm(scaled - solution[:3], axis=1) - radius)
+        miss = np.abs(lengths_of(scaled - solution[:3]) - radius)
     weight = root[fitted] ** 2
     around = scaled[fitted] - np.sum(weight * scaled[fitted], 0) / weight.sum()
     thinnest = np.linalg.svd(around * root[fitted], compute_uv=False)[-1] / np.sqrt(weight.sum())
