@@ -1,7 +1,5 @@
 """Statistics of a production line: capability, control charts, gauge studies, tolerance intervals, drift."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass

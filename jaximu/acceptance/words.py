@@ -1,7 +1,5 @@
 """Names and amounts of what limits are put on, as a person says them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is known of units on one rigid body, as `array.json` has it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

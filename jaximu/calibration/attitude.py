@@ -1,7 +1,5 @@
 """Calibration against a measured attitude on its own clock: optics, an inertial system, a robot, a tracker."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -213,7 +211,7 @@ def _begin(recording: Recording, start: _Start, effects: Sequence[Effect], unit:
     )
     imu = as_stated(recording) if unit is None else unit.transferable()
     if unit is None and imu.gyroscope is not None:
-        imu = replace(imu, gyroscope=replace(imu.gyroscope, gain=np.asarray(imu.gyroscope.gain) @ start.arranged))
+        imu = replace(imu, gyroscope=replace(imu.gyroscope, gain=imu.gyroscope.gain @ start.arranged))
     by_name = {effect.name: effect for effect in (*setup, *imu.all_effects().values(), *effects)}
     return on_host(imu.with_effects(*by_name.values()))
 

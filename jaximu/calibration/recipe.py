@@ -1,7 +1,5 @@
 """Calibration from recordings of poses and turns by hand, the one recipe behind [`jaximu.calibrate`][]."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -387,4 +385,4 @@ def _mean_temperature(recordings: Sequence[Recording], observations: Observation
     if any(recording.temperature is None for recording in recordings):
         return {}
     poses = observations.poses
-    return {"temperature": float(np.mean(np.asarray(poses.temperature)[np.asarray(poses.mask)]))}
+    return {"temperature": float(np.mean(poses.temperature[poses.mask]))}

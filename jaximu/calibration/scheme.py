@@ -4,8 +4,6 @@ Without effects the three axes of a triad share one design: the mean inputs ū o
 bias. A combination n of the four columns that no station excites, [ū 1] n = 0, is open in every axis: three parameters.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -39,10 +37,10 @@ class Scheme:
 
 def describe_scheme(stations: Stations) -> tuple[Scheme, ...]:
     """Return what the stations determine of the accelerometer and of the gyroscope, 12 parameters each."""
-    weight = np.asarray(stations.weight)[..., None]
+    weight = stations.weight[..., None]
     stimulus = stations.stimulus
     return tuple(
-        _scheme(triad, dot_rows(weight, np.asarray(quantity))[np.asarray(used)])
+        _scheme(triad, dot_rows(weight, quantity)[used])
         for triad, quantity, used in (
             ("accelerometer", stimulus.specific_force, stations.accelerometer_used),
             ("gyroscope", stimulus.angular_rate, stations.gyroscope_used),

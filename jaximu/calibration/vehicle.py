@@ -6,8 +6,6 @@ and before one the force less that at the stop adds up to a speed along the vehi
 direction in the horizontal plane along which these speeds lie best, in the sense of least squares, is the vehicle's.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -203,7 +201,7 @@ def _least_squares(
     weighted = np.linalg.solve(covariance, design).T
     inverse = np.linalg.pinv(weighted @ design)
     reactions = inverse @ weighted
-    return reactions @ values, np.asarray(inverse, np.float64), reactions
+    return reactions @ values, inverse, reactions
 
 
 def _followed(

@@ -1,7 +1,5 @@
 """`jaximu budget`: how each error of the set-up reaches each parameter."""
 
-from __future__ import annotations
-
 import inspect
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`jaximu check`: is an old calibration still valid for a new recording, and what moved?"""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Literal
 

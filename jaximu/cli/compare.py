@@ -1,7 +1,5 @@
 """`jaximu compare`: what moved between calibrations of a unit, and how it drifts over its history."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal

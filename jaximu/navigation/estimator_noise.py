@@ -130,7 +130,7 @@ class ModelledErrors:
         first = _spread(np.arange(0, len(intervals) - size + 1, size))
         rows = first[:, None] + np.arange(size)
         start = np.cumulative_sum(intervals, include_initial=True)[first]
-        rates, forces = (np.asarray(samples)[rows] for samples in (stimulus.angular_rate, stimulus.specific_force))
+        rates, forces = (samples[rows] for samples in (stimulus.angular_rate, stimulus.specific_force))
         return Stretches(rates, forces, intervals[rows], start, rows)
 
     @cached_property
@@ -196,7 +196,7 @@ class MeasuredErrors:
         tilt = scipy.spatial.transform.Rotation.from_rotvec(np.append(mounting.tilt, 0.0))
         whole = replace(known, quaternion=np.asarray(mounting.unit_attitude(known.quaternion))).rotation()
         velocity = known.velocities()
-        stamp = np.asarray(mounting.on_log(known.time))
+        stamp = mounting.on_log(known.time)
         felt = interpolated(middle, np.asarray(force), stamp)
         steady = np.ones(len(stamp), bool)
         notes: list[str] = []
@@ -583,7 +583,7 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
             if of_kind.any() and kind != f"{triad} bias":
                 parts[kind] = _squared(moved[..., of_kind] @ root_of(submatrix(covariance, of_kind)))
         terms[triad] = {name: covariances[:, rows, rows] for name, covariances in parts.items()}
-    return _Length(stretches, spread, moment, roots, np.asarray(whole), moved @ root_of(covariance), terms, block)
+    return _Length(stretches, spread, moment, roots, whole, moved @ root_of(covariance), terms, block)
 
 
 def _measured_part(stretches: Stretches, spread: dict[tuple[str, str], FloatArray], block: IntArray) -> _Length:

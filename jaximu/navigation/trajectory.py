@@ -123,7 +123,7 @@ class Trajectory:
         """Raise `NotPossibleError` where the path leaves a sensor's range, by triad in m/s² and rad/s."""
         for triad, limit in limits.items():
             gyroscope = triad == "gyroscope"
-            felt = np.asarray(self.stimulus.angular_rate if gyroscope else self.stimulus.specific_force)
+            felt = self.stimulus.angular_rate if gyroscope else self.stimulus.specific_force
             beyond = np.abs(felt) > limit
             if beyond.any():
                 row, axis = (int(index[0]) for index in np.nonzero(beyond))

@@ -525,7 +525,7 @@ def _prior(known: Known, imu: Imu, parameters: Parameters, by_gravity: FloatArra
         np.linalg.cholesky(total)
     except np.linalg.LinAlgError as error:
         raise InputError(f"{known.source}: the covariance of its parameters is not positive definite.") from error
-    return np.asarray(np.linalg.inv(total), float)
+    return np.linalg.inv(total)
 
 
 _UPPER = tuple(name for name in names_of(Imu.nominal()) if not without_equipment(name))

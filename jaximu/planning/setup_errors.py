@@ -338,7 +338,7 @@ def _attitude_roots(stops: _Stops, kind: str) -> dict[str, FloatArray]:
         "mounting": mounting,
         "orthogonality": np.stack([tilting, spindle], axis=2),
     }
-    return {name: np.asarray(root.reshape(3 * count, -1), np.float64) for name, root in roots.items()}
+    return {name: root.reshape(3 * count, -1) for name, root in roots.items()}
 
 
 def _mean_covariances(squares: Mapping[str, FloatArray], start: FloatArray, stop: FloatArray):
@@ -410,11 +410,11 @@ def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...]
         add(name, np.diag(sizes), coefficient)
         coefficient += len(sizes)
     if shaken := _stated(errors, "vibration").get("noise", 0.0):
-        during = np.asarray(stations.turn & stations.gyroscope_used) / np.sqrt(_durations(stations))
+        during = (stations.turn & stations.gyroscope_used) / np.sqrt(_durations(stations))
         scale = case.imu.triads()["gyroscope"].scales
         add("vibration", np.diag((shaken * scale[:, None] * during).ravel()), added + 3 * size)
     for name, covariances in (("noise", fast), ("bias_instability", slow)):
-        add(name, np.asarray(block_diag(*root_of(covariances))), added)
+        add(name, block_diag(*root_of(covariances)), added)
 
     return scheme, tuple(_source(errors, name, root) for name, root in roots.items() if root.size), notes
 
@@ -427,7 +427,7 @@ def _source(errors: StatedErrors, name: str, root: FloatArray) -> ErrorSource:
 
 def _durations(stations: Stations) -> FloatArray:
     """Durations (S,), s; one for padding."""
-    duration = np.asarray(stations.stop) - np.asarray(stations.start)
+    duration = stations.stop - stations.start
     return np.where(duration > 0, duration, 1.0)
 
 
@@ -452,11 +452,11 @@ def _with_noise(case: Case, stations: Stations, intervals: Sequence[ScheduleEntr
             notes.append(f"no white noise is stated for the {name}: {np.sqrt(density[0]):.2g} {unit} is assumed.")
         parts, ramps[name] = _mean_covariances(squares, *span.T), np.sqrt(squares.get("R", np.zeros(3)))
         scale = triad.scales[:, None, None]
-        there = np.asarray(used[name])[:count]
+        there = used[name][:count]
         for whole, part in zip((fast, slow), parts, strict=True):
             whole[3 * number : 3 * number + 3, :count, :count] = np.where(there[:, None] & there, part * scale**2, 0.0)
     total = fast + slow
-    unused = np.concatenate([np.tile(~np.asarray(mask), (3, 1)) for mask in used.values()])
+    unused = np.concatenate([np.tile(~mask, (3, 1)) for mask in used.values()])
     total += unused[:, :, None] * np.eye(size)
     stations = replace(stations, accelerometer_covariance=total[:3], gyroscope_covariance=total[3:])
     return stations, fast, slow, ramps, tuple(notes)
@@ -513,8 +513,8 @@ def _scheme(
     ends, axis, angle = np.zeros((size, 2), np.int64), np.zeros((size, 3)), np.full(size, np.inf)
     ends[:count], axis[:count] = stops.ends, [interval.vector for interval in intervals]
     angle[:count] = [interval.angle if interval.kind == "turn" else np.inf for interval in intervals]
-    pace = np.einsum("sqi,si->sq", np.asarray(stations.stimulus.angular_rate), axis) / angle[:, None]
+    pace = np.einsum("sqi,si->sq", stations.stimulus.angular_rate, axis) / angle[:, None]
     done = (np.cumsum(pace, axis=1) - pace / 2) * (_durations(stations) / pace.shape[1])[:, None]
     rms = _stated(errors, "vibration").get("rms", 0.0)
-    power = np.where(np.asarray(stations.turn)[:, None], rms**2, np.zeros_like(pace))
+    power = np.where(stations.turn[:, None], rms**2, np.zeros_like(pace))
     return ErrorScheme(unit, effects, stations, motion, ends, done, pace, power, len(stops.up))

@@ -1,7 +1,5 @@
 """Recordings of several files: the folder or ZIP archive in which a phone's app writes one file a sensor."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import tempfile
