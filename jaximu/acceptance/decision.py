@@ -94,4 +94,4 @@ def coverage(freedom: ArrayLike, k: float = 2.0) -> FloatArray:
 
 def worst(verdicts: ArrayLike) -> str:
     """Return the verdict of a whole: fail if any fails, else undecided if any is, else pass."""
-    return max(np.ravel(np.asarray(verdicts)).tolist(), key=VERDICTS.index, default=UNDECIDED)
+    return max(np.asarray(verdicts).ravel().tolist(), key=VERDICTS.index, default=UNDECIDED)

@@ -483,7 +483,7 @@ def _output(first: Epoch, last: Epoch, owner: str, over: float) -> OutputChange:
     for shift in [common[0] + common[1]] if first.gravity == last.gravity else common:
         spread += shift[:, :, None] * shift[:, None, :]
     length = lengths_of(values)
-    worst = int(np.argmax(length))
+    worst = int(length.argmax())
     along = values[worst] / (length[worst] or 1.0)
     return OutputChange(
         float(length[worst]),

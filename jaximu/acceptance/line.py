@@ -267,7 +267,7 @@ def read_table(path: FilePath) -> Batch:
     scales = [0, 4, 8]
     variances = variances_of(covariance)[:, [free.index(index) for index in scales]]
     added = numbers("accel_gain_sigma")[:, scales] ** 2 - variances
-    gravity = root_or_zero(np.mean(added / values[:, scales] ** 2, axis=1))
+    gravity = root_or_zero((added / values[:, scales] ** 2).mean(axis=1))
     by_gravity = np.where(np.array(free) < 9, values[:, free], 0.0) * gravity[:, None]
     units = Units(
         like if gyroscope else Imu(like.accelerometer, None),
@@ -332,7 +332,7 @@ def _in_counts(table: Batch, nominal: Scales) -> dict:
 
 def _first_recordings(table: Batch) -> IntArray:
     """Return the place of each device's first recording, by date, in the order of the dates; undated ones come last."""
-    order = np.argsort(np.where(np.isnan(table.days), np.inf, table.days), kind="stable")
+    order = np.where(np.isnan(table.days), np.inf, table.days).argsort(kind="stable")
     first = np.unique(np.array(table.devices)[order], return_index=True)[1]
     return order[np.sort(first)]
 
@@ -415,7 +415,7 @@ def _alarms(
         what = spoken(name) + (f" at station {station}" if station else "")
         off = np.abs(chart.average - chart.centre)
         if len(chart.drifting):
-            start, most = int(chart.drifting[0]), int(chart.drifting[np.argmax(off[chart.drifting])])
+            start, most = int(chart.drifting[0]), int(chart.drifting[off[chart.drifting].argmax()])
             side = "above" if chart.average[most] > chart.centre else "below"
             texts = (
                 f"{what}: the moving average left its limits at {_when(table, int(places[start]))} and is farthest, ",
@@ -427,7 +427,7 @@ def _alarms(
         if len(hits):
             before = np.concatenate([[np.nan], chart.values[:-1]])
             away = chart.values - (chart.centre if kind == "value" else before)
-            most = int(hits[np.argmax(np.abs(away[hits]))])
+            most = int(hits[np.abs(away[hits]).argmax()])
             relation = "is off the mean by" if kind == "value" else "differs from the unit before by"
             more = f"; {len(hits) - 1} more units are beyond the limits" if len(hits) > 1 else ""
             texts = (f"{what}: {_when(table, int(places[most]))} {relation} ", more)
@@ -444,7 +444,7 @@ def _groups(labels: Sequence[str], first: IntArray) -> dict[str, IntArray]:
     of_first = np.array(labels)[first]
     names = [label for label in sorted(set(of_first.tolist())) if label]
     return {
-        label: first[of_first == label] for label in names if len(names) > 1 and np.sum(of_first == label) >= FEWEST
+        label: first[of_first == label] for label in names if len(names) > 1 and (of_first == label).sum() >= FEWEST
     }
 
 
@@ -479,7 +479,7 @@ def _shift(values: FloatArray, inside: BoolArray, all_of: BoolArray) -> tuple[fl
     sides = values[inside], values[all_of & ~inside]
     parts = np.array([np.var(side, ddof=1) / len(side) for side in sides])
     shift, variance = float(sides[0].mean() - sides[1].mean()), float(parts.sum())
-    freedom = variance**2 / float(np.sum(parts**2 / np.array([len(side) - 1 for side in sides])))
+    freedom = variance**2 / float((parts**2 / np.array([len(side) - 1 for side in sides])).sum())
     return shift, float(student_two_sided(shift / np.sqrt(variance), freedom))
 
 

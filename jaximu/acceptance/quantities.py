@@ -154,7 +154,7 @@ def measure(units: Units, nominal: Scales, outputs: Sequence[Limit]) -> Measured
     names = (*_parameter_names(units.like), *(f"{limit.key}[{axis}]" for limit, _ in ranges for axis in range(3)))
     sizes = flatten(typical_sizes(unflatten(units.like, np.median(units.numbers, axis=0))))[indices]
     open_ = sigmas_of(units.covariance) > UNDETERMINED * sizes
-    determined = ~np.any((np.abs(slope) > 0) & open_[:, None], axis=2)
+    determined = ~((np.abs(slope) > 0) & open_[:, None]).any(axis=2)
     return Measured(
         names,
         value,

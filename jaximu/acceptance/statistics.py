@@ -37,7 +37,7 @@ def capability(values: FloatArray, low: float, high: float) -> Capability:
     Cp = (high − low)/6s, with the interval of χ² for s; Cpk = min(high − mean, mean − low)/3s, with Bissell's variance
     1/9n + Cpk²/2(n − 1) (Applied Statistics 39, 1990). s is that of all units, what moves in time included.
     """
-    count, mean, deviation = len(values), float(np.mean(values)), float(np.std(values, ddof=1))
+    count, mean, deviation = len(values), float(values.mean()), float(values.std(ddof=1))
     with np.errstate(divide="ignore", invalid="ignore"):
         cp = float(np.float64(high - low) / (6 * deviation)) if np.isfinite(high - low) else np.nan
         cpk = float(np.float64(min(high - mean, mean - low)) / (3 * deviation))
@@ -75,7 +75,7 @@ def control_chart(values: FloatArray, level: float) -> Chart:
     count = len(values)
     ranges = np.abs(np.diff(values))
     # two normal numbers have a mean range of 2/√π = 1.128 of their deviation
-    centre, deviation = float(np.mean(values)), float(np.mean(ranges) * np.sqrt(np.pi) / 2)
+    centre, deviation = float(values.mean()), float(ranges.mean() * np.sqrt(np.pi) / 2)
     bound = float(normal_isf(level / 2 / count))
     average = np.empty(count)
     running = centre
@@ -173,7 +173,7 @@ def gauge(values: FloatArray, sigma: FloatArray, parts: Sequence[str], places: S
         of_place = max(squares / (sites - 1) - against, 0.0) / size + max(against - error / rest, 0.0)
         reproducibility = float(np.sqrt(of_place / number[0]))
     root = float(np.sqrt(error / rest))
-    typical = (count - np.sum(np.bincount(part) ** 2) / count) / (size - 1)  # repetitions, if they differ
+    typical = (count - (np.bincount(part) ** 2).sum() / count) / (size - 1)  # repetitions, if they differ
     square = about_means(part, 1 / sigma**2)
     return Gauge(
         (root, *(root * deviation_interval(rest)).tolist()),

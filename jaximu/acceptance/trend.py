@@ -52,7 +52,7 @@ def sameness(values: FloatArray, covariance: FloatArray) -> Sameness:
     roots, vectors = np.linalg.eigh(spread / scale[:, None] / scale)
     kept = roots > _ROUNDING * roots[-1]
     along = vectors[:, kept].T @ (difference / scale)
-    statistic, freedom = float(np.sum(along**2 / roots[kept])), int(kept.sum())
+    statistic, freedom = float((along**2 / roots[kept]).sum()), int(kept.sum())
     return Sameness(statistic, freedom, float(chi2_sf(statistic, freedom)))
 
 
@@ -81,7 +81,7 @@ class StraightLine:
         contrasts, left = _contrasts(columns), len(times) - 2
         roots, vectors = np.linalg.eigh(contrasts @ covariance @ contrasts.T)
         squares = (vectors.T @ (contrasts @ values)) ** 2
-        statistic = float(np.sum(squares / roots))
+        statistic = float((squares / roots).sum())
         p_value = float(chi2_sf(statistic, left)) if left else 1.0
         variance = _excess(squares, roots, left) if p_value < _DOUBT else 0.0
         weights = np.linalg.inv(covariance + variance * np.eye(len(times)))
@@ -145,5 +145,5 @@ def _excess(squares: FloatArray, roots: FloatArray, left: int) -> float:
     from scipy.optimize import brentq
 
     most = float(squares.sum()) / left
-    excess: Any = brentq(lambda excess: np.sum(squares / (roots + excess)) - left, 0.0, most)
+    excess: Any = brentq(lambda excess: (squares / (roots + excess)).sum() - left, 0.0, most)
     return float(excess)

@@ -128,7 +128,7 @@ def _axes(arranged: FloatArray) -> Finding:
 
 def _wrong(matrix: FloatArray) -> int:
     """Return how many axes of a map are exchanged or turned round."""
-    return int(np.sum(np.diag(matrix) != 1) + np.sum(matrix < 0))
+    return int((np.diag(matrix) != 1).sum() + (matrix < 0).sum())
 
 
 def _described(matrix: FloatArray) -> str:
@@ -149,7 +149,7 @@ def _factors(name: str, scale: FloatArray, triad: Triad) -> list[Finding]:
     """Name scales that are a whole factor off the data sheet's, or off by more than sensors are."""
     sizes = triad.scales / scale
     logarithm = np.log(sizes)
-    usual, odd = float(np.exp(np.mean(logarithm))), np.abs(logarithm) > _ODD
+    usual, odd = float(np.exp(logarithm.mean())), np.abs(logarithm) > _ODD
     option = "--accel-scale" if name == "accelerometer" else "--gyro-scale"
     like = "another full-scale range" + (", or a sample rate that is as far off" if name == "gyroscope" else "")
     whole = np.zeros(3)

@@ -317,7 +317,7 @@ def _scatter(errors: Sequence[FloatArray]) -> list[tuple[float | None, float | N
 def _averaged(shared: _Shared, corrected: Sequence[Recording], units: Sequence[ArrayUnit]) -> Averaged:
     """Return the scatter at rest of a typical unit and of the mean of all, each weighted by its own variance."""
     edges = [np.arange(a, b - _BLOCK, _BLOCK) for a, b in shared.rests]
-    start, rest = np.concatenate(edges), np.repeat(np.arange(len(edges)), list(map(len, edges)))
+    start, rest = np.concatenate(edges), np.arange(len(edges)).repeat(list(map(len, edges)))
     freedom = 3 * (len(rest) - len(edges))
     averaged = []
     for name in ("gyroscope", "accelerometer"):
@@ -329,12 +329,12 @@ def _averaged(shared: _Shared, corrected: Sequence[Recording], units: Sequence[A
             means = np.stack([np.bincount(rest, axis) for axis in values.T], 1) / np.bincount(rest)[:, None]
             outputs.append(values - means[rest])
         variance = np.array([np.sum(values**2) / freedom for values in outputs])
-        mean = np.einsum("u,uik->ik", (1 / variance) / np.sum(1 / variance), np.array(outputs))
+        mean = np.einsum("u,uik->ik", (1 / variance) / (1 / variance).sum(), np.array(outputs))
         averaged.append(
             (
                 float(np.sqrt(np.median(variance))),
-                float(np.sqrt(np.sum(mean**2) / freedom)),
-                float(np.sqrt(1 / np.sum(1 / variance))),
+                float(np.sqrt((mean**2).sum() / freedom)),
+                float(np.sqrt(1 / (1 / variance).sum())),
             )
         )
     return Averaged(*averaged)

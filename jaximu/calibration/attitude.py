@@ -196,7 +196,7 @@ def _of_shape(calibration: Calibration, measurement: AgainstAttitude) -> FloatAr
     matrix = np.asarray(imu.triads()["gyroscope"].inverse())
     rate, slope = data.rate @ matrix[:, :3].T + matrix[:, 3], data.slope @ matrix[:, :3].T
     spread = abs(float(Mounting.of(imu).filter_variance))
-    delay = spread**1.5 / 3 * np.sum(slope**2) / np.sum(rate**2)
+    delay = spread**1.5 / 3 * (slope**2).sum() / (rate**2).sum()
     effects = imu.all_effects()
     delayed = [isinstance(effects.get(name.key), SetupReferenceDelay) for name in calibration.names]
     return delay**2 * np.diag(delayed)
@@ -380,11 +380,11 @@ def _same_unit(recording: Recording, start: _Start, imu: Imu) -> list[str]:
     if min(count, quiet) < _FEWEST:
         return []
     moved, apart = (
-        np.mean(np.diff(values, 2, axis=0)[: count * _BLOCK].reshape(count, -1) ** 2, axis=1)
+        (np.diff(values, 2, axis=0)[: count * _BLOCK].reshape(count, -1) ** 2).mean(axis=1)
         for values in (unit, unit - reference @ turned)
     )
     still = np.argsort(moved)[: max(_FEWEST // 2, count // 10)]
-    powers = np.mean(samples[: quiet * _LONGER].reshape(quiet, -1) ** 2, axis=1)
+    powers = (samples[: quiet * _LONGER].reshape(quiet, -1) ** 2).mean(axis=1)
     white = np.quantile(powers, 0.1) / (20 * gyroscope.rate)  # density; a third difference has 20 times the variance
     ratio = float(np.mean(apart[still]) / (6 * white / np.median(np.diff(time))))
     if ratio > _CLOSER:
@@ -466,7 +466,7 @@ def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
         weight = np.sum(turning**2) / np.sum(force**2)
         matrix = turning_best(turning.T @ rotating + weight * STANDARD.value * (force.T @ up))
         explained = 1 - np.sum((turning - rotating @ matrix.T) ** 2) / np.sum(turning**2)
-        upright = np.mean(dot_rows(force, up @ matrix.T)) / np.mean(lengths_of(force))
+        upright = dot_rows(force, up @ matrix.T).mean() / lengths_of(force).mean()
         if best is None or explained > best.explained:
             best = _Start(attitude, float(delay + shift), matrix, float(explained), float(upright))
     if best is None:

@@ -76,7 +76,7 @@ def with_open_misalignments_held(
     """Return a unit's fit, made again with what sensors have as a prior where its misalignments are known less well."""
     prior = known_misalignments(nominal, fitted.names)
     sigma = fitted.sigmas()[[fitted.names.index(name) for name in prior.names]]
-    if method.startswith("two-step") or not np.any(sigma * np.diag(prior.root) > 1):
+    if method.startswith("two-step") or not (sigma * np.diag(prior.root) > 1).any():
         return fitted, None
     data = PosesAndTurns.of(observations, "norm" if method == "accelerometer" else "all")
     return fit(nominal, data, prior=prior, loss=loss, excess=fitted.excess), prior

@@ -61,7 +61,7 @@ def separated(shapes: ThermalShapes) -> dict[str, Separation]:
     blocks = shapes.blocks
     root = np.sqrt(blocks.stop - blocks.start)[:, None]
     levels, drift = np.eye(blocks.levels)[blocks.level], np.eye(int(blocks.log.max()) + 1)[blocks.log]
-    drift = drift * (blocks.start / np.max(np.abs(blocks.stop)))[:, None]
+    drift = drift * (blocks.start / np.abs(blocks.stop).max())[:, None]
     mean = orthonormal(root * levels)
     base = orthonormal(root * np.concatenate([levels, drift, shapes.smooth()], axis=1))
     grids: dict[str, list[ThermalTerm]] = {name: [ThermalTerm(name)] for name in RATES}
@@ -92,7 +92,7 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
     observable = [*POWERS, LEARNED, *(name for name, part in parts.items() if part.alone > _TOLD)]
     if len(legs) > _LISTED:
         low, high = blocks.range
-        fast = 60 * float(np.max(np.abs(blocks.rate)))
+        fast = 60 * float(np.abs(blocks.rate).max())
         span = f"{low:.0f} and {high:.0f} °C".replace("-", "−")
         words = [f"The temperature went {len(legs)} ways up and down between {span}, at up to {fast:.2g} K/min."]
     else:

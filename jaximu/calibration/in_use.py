@@ -305,7 +305,7 @@ class FilterInUse:
         start, end = time[0] - period if self._last is None else self._last, float(time[-1])
         self._last = end
         step = np.diff(time, prepend=start)
-        lost = float(np.sum(np.where(step > 2.5 * period, step - period, 0.0)))
+        lost = float(np.where(step > 2.5 * period, step - period, 0.0).sum())
         rest, arrival, begins, speed = self._rests(rate, force, lost)
         sightings = self._sightings(start + period / 2, end + period / 2, rest or arrival)
         absolute = bool(sightings)

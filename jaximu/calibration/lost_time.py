@@ -166,7 +166,7 @@ class _Turned:
         sampling = np.square(np.log(np.maximum(_SAMPLING, 0.02) / _USUAL_SAMPLING) / _SAMPLING_SPREAD)
         beforehand = -np.add.outer(scatter, sampling) / 2
         evidence += beforehand - np.logaddexp.reduce(beforehand, axis=None)
-        likeliest = int(np.argmax(evidence)) // len(_SAMPLING)
+        likeliest = int(evidence.argmax()) // len(_SAMPLING)
         return self.constant + float(np.logaddexp.reduce(evidence, axis=None)), float(_SCATTER[likeliest] ** 2)
 
 
@@ -251,13 +251,13 @@ class _Recorded:
             bend = np.zeros(len(difference))
             bend[1:-1] = lengths_of(difference[1:-1] - (difference[2:] + difference[:-2]) / 2)
             gaps = np.flatnonzero(np.diff(signal.time) > 1.6 / signal.rate)
-            bend[np.clip(gaps[:, None] + np.arange(-1, 2), 0, len(bend) - 1)] = 0.0
+            bend[(gaps[:, None] + np.arange(-1, 2)).clip(0, len(bend) - 1)] = 0.0
             bends.append(bend)
         usual = float(np.median(np.concatenate([bends[p][a : b - 1] for p, a, b in self.samples])))
         jumps = []
         for part, start, stop in self.samples:
             beside = np.arange(start, stop - 1)[:, None] + np.array([-3, -2, 2, 3])
-            around = np.mean(bends[part][np.clip(beside, 0, len(bends[part]) - 1)] ** 2, axis=1)
+            around = np.mean(bends[part][beside.clip(0, len(bends[part]) - 1)] ** 2, axis=1)
             jumps.append(bends[part][start : stop - 1] / np.sqrt(around + (_LEAST_JUMP * usual) ** 2 + 1e-30))
         return jumps
 
@@ -283,7 +283,7 @@ class _Recorded:
         moved = wanted - carried
         left = np.abs(dot_rows(moved, axis)) / np.maximum(lengths_of(moved), 1e-12)
         carried, wanted = (
-            gravity - axis * np.sum(gravity * axis, axis=1, keepdims=True) for gravity in (carried, wanted)
+            gravity - axis * (gravity * axis).sum(axis=1, keepdims=True) for gravity in (carried, wanted)
         )
         angle = -np.arctan2(dot_rows(axis, np.cross(carried, wanted)), dot_rows(carried, wanted))
         return angle / speed, left
@@ -334,7 +334,7 @@ def without_lost_stretches(calibration: Calibration) -> tuple[list[Recording], l
         )
         # where the rate is nearly zero, the time could be anything: nothing is lost for longer than the recording
         sure[(time <= 0) | (time > np.ptp(recorded.signals[recorded.samples[turn][0]].time))] = -np.inf
-        interval = int(np.argmax(sure))
+        interval = int(sure.argmax())
         if sure[interval] < _SURE:
             continue
         (clipped if _reaches_a_limit(recorded, turn) else stretches).append((turn, interval, float(time[interval])))
@@ -346,7 +346,7 @@ def _reaches_a_limit(recorded: _Recorded, turn: int) -> bool:
     part, first, last = recorded.samples[turn]
     values = recorded.signals[part].values
     extremes = np.stack([values.max(axis=0), values.min(axis=0)])
-    return bool(np.max(np.sum(values[first:last] == extremes[:, None], axis=1)) > 1)
+    return bool((values[first:last] == extremes[:, None]).sum(axis=1).max() > 1)
 
 
 def _left_out(
@@ -421,7 +421,7 @@ def lost_share(calibration: Calibration) -> list[Finding]:
     # of shot noise: the mean, and what covaries with the turn's misfit
     missing = share * (recorded.counts + np.einsum("tsa,ta->t", recorded.lacking, pull))
     total = share * recorded.counts.sum()
-    worst = np.argsort(missing)[::-1][:3]
+    worst = missing.argsort()[::-1][:3]
     period = float(np.median(recorded.interval[recorded.interval > 0]))
     where = "; ".join(f"{missing[turn]:.0f} from {recorded.span(turn)}" for turn in worst if missing[turn] >= 1)
     return [
@@ -442,7 +442,7 @@ def _gain(turned: _Turned) -> tuple[float, float]:
     """Return the likeliest share of samples lost, and by how many nats losses beat none, averaged over the shares."""
     without = turned.evidence(0.0)[0]
     gains = np.array([turned.evidence(share)[0] for share in _SHARES]) - without
-    return float(_SHARES[np.argmax(gains)]), float(np.logaddexp.reduce(gains) - np.log(len(gains)))
+    return float(_SHARES[gains.argmax()]), float(np.logaddexp.reduce(gains) - np.log(len(gains)))
 
 
 def _effects(recorded: _Recorded) -> float:

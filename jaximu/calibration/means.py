@@ -110,7 +110,7 @@ def _step(values: FloatArray) -> float:
     for digits in range(7):
         for unit in (1.0, STANDARD_GRAVITY):
             scaled = values / unit * 10.0**digits
-            if np.all(np.abs(scaled - np.round(scaled)) < 1e-6 * np.maximum(np.abs(scaled), 1.0)):
+            if (np.abs(scaled - scaled.round()) < 1e-6 * np.maximum(np.abs(scaled), 1.0)).all():
                 return unit * 10.0**-digits
     return 1e-6
 

@@ -89,7 +89,7 @@ def refuse_undetermined(fitted: Fit, prior: Prior | None, wholly: bool = False) 
     An effect of which a prior says something is let through; with `wholly` one of which a part is determined, too.
     """
     known = set() if prior is None else set(prior.names)
-    jacobian = fitted.jacobian
+    jacobian = np.asarray(fitted.jacobian)
     for (owner, position), effect in fitted.imu.all_effects().items():
         members = np.array([name.key == (owner, position) for name in fitted.names])
         if not members.any() or any(name in known for name, mine in zip(fitted.names, members, strict=True) if mine):
@@ -113,9 +113,9 @@ def refuse_undetermined(fitted: Fit, prior: Prior | None, wholly: bool = False) 
 
 def relative_covariance(fitted: Fit) -> FloatArray:
     """Return the covariance (p, p) of a fit's parameters over their typical sizes."""
-    return fitted.covariance / fitted.sizes[:, None] / fitted.sizes
+    return np.asarray(fitted.covariance) / fitted.sizes[:, None] / fitted.sizes
 
 
 def _open_directions(covariance: FloatArray, rows: Sequence[int]) -> int:
     """How many directions of these parameters are known no better than from the data sheet."""
-    return int(np.sum(np.linalg.eigvalsh(submatrix(covariance, rows)) > UNDETERMINED**2))
+    return int((np.linalg.eigvalsh(submatrix(covariance, rows)) > UNDETERMINED**2).sum())

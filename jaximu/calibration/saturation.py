@@ -32,7 +32,7 @@ def saturation(calibration: Calibration) -> list[Finding]:
     scale = nominal.triads()["gyroscope"].scales
     bias, inside = calibration.imu.triads()["gyroscope"].bias, turns.interval > 0
     rate = np.where(inside[..., None], (turns.output - bias) / scale, 0.0)
-    greatest = float(np.max(np.abs(rate)))
+    greatest = float(np.abs(rate).max())
 
     def scatter(changed) -> float:
         turned = replace(turns, output=bias + scale * changed)

@@ -89,7 +89,7 @@ def calibrate_at_stops(
     sites = _sites(stops.intervals)
     up = _mean_direction(_by_site(force, sites))
     earth, spread = _earth(up, gravity.latitude)
-    longest = np.sort(np.argsort(-np.diff(stops.intervals)[:, 0])[:_MOST])
+    longest = np.sort((-np.diff(stops.intervals)[:, 0]).argsort()[:_MOST])
     rate, history = _rate(gyroscope, stops.intervals[longest], earth, known)
     scale = gyroscope.nominal_scale
     felt = scale[:, None] * spread * scale  # of the Earth's rotation, the same throughout
@@ -201,7 +201,7 @@ def _least_squares(
     weighted = np.linalg.solve(covariance, design).T
     inverse = np.linalg.pinv(weighted @ design)
     reactions = inverse @ weighted
-    return reactions @ values, inverse, reactions
+    return reactions @ values, np.asarray(inverse, float), reactions
 
 
 def _followed(
@@ -223,7 +223,7 @@ def _followed(
     estimates, sigmas, drifts, innovations = [], [], [], []
     gaps = np.diff((start + stop) / 2, prepend=-np.inf)
     for gap, value, sigma in zip(gaps, values, np.sqrt(variance), strict=True):
-        kept = np.repeat(np.exp(-gap / drift.correlation_time), 3)
+        kept = np.exp(-gap / drift.correlation_time).repeat(3)
         driven = 1 / (spread * np.sqrt(np.maximum(1 - kept**2, _SHORTEST)))
         rows = WhiteRows(
             np.concatenate([np.diag(-driven * kept), np.zeros((3, size))]),
@@ -238,7 +238,7 @@ def _followed(
         sigmas.append(sigmas_of(whole @ covariance @ whole.T))
         drifts.append([states @ estimated[:size], sigmas_of(states @ covariance[:size, :size] @ states.T)])
         innovations.append(innovation)
-    of_rate = np.pad(np.swapaxes(np.array(drifts), 0, 1) / scale, ((0, 0), (0, 0), (0, 3)))
+    of_rate = np.pad(np.array(drifts).swapaxes(0, 1) / scale, ((0, 0), (0, 0), (0, 3)))
     resting, freedom = np.ones(count, bool), np.where(np.arange(count) > 0, 3.0, 0.0)
     innovations = np.where(freedom > 0, innovations, 0.0)
     return History(
@@ -251,7 +251,7 @@ def _followed(
 
 def _sites(intervals: FloatArray) -> IntArray:
     """Return the site (P,) of each stop: after a few seconds of motion a vehicle stands on the same slope again."""
-    return np.append(0, np.cumsum(intervals[1:, 0] - intervals[:-1, 1] > _ELSEWHERE))
+    return np.append(0, (intervals[1:, 0] - intervals[:-1, 1] > _ELSEWHERE).cumsum())
 
 
 def _by_site(values: FloatArray, sites: IntArray) -> FloatArray:
@@ -300,7 +300,7 @@ def _mounted(
             {"start": float(begin), "stop": float(end), "tilt": tilt.tolist()}
             for (begin, end), tilt in zip(stops.intervals, tilts @ (axes[:2] @ across.T).T, strict=True)
         ],
-        "seconds": float(np.sum(np.diff(stops.intervals))),
+        "seconds": float(np.diff(stops.intervals).sum()),
         "up": up.tolist(),
         "forward": ahead.tolist() if determined else None,
         "roll": _entry(angles[0], sigmas[0], "rad"),
@@ -336,7 +336,7 @@ def _speeds(
     recording, intervals = stops.recording, stops.intervals
     accelerometer, gyroscope = recording.accelerometer, recording.signals["gyroscope"]
     time, sensed = accelerometer.time, accelerometer.si()
-    heading = np.cumsum((gyroscope.si() - bias) @ up * np.gradient(gyroscope.time))
+    heading = ((gyroscope.si() - bias) @ up * np.gradient(gyroscope.time)).cumsum()
     course = np.exp(1j * np.interp(time, gyroscope.time, heading))
     step = np.gradient(time)
     edges = [time[0], *((intervals[1:, 0] + intervals[:-1, 1]) / 2), time[-1]]
@@ -347,10 +347,10 @@ def _speeds(
         for sign, first, last in (before, after):
             rows = np.flatnonzero((time >= first) & (time < last))[::sign]
             turned = np.abs(np.angle(course[rows] / course[rows[:1]])) > _STRAIGHT
-            rows = rows[: int(np.argmax(turned)) if turned.any() else None]
+            rows = rows[: int(turned.argmax()) if turned.any() else None]
             if last - first > 1.0 and len(rows):
                 gained = (sensed[rows] - force[number]) @ across.T @ np.array([1.0, 1j])
-                speed = sign * np.sum(gained * step[rows] * course[rows]) / course[rows[-1]]
+                speed = sign * (gained * step[rows] * course[rows]).sum() / course[rows[-1]]
                 sides.append(number)
                 speeds.append([speed.real, speed.imag])
     return np.array(sides, int), np.array(speeds).reshape(-1, 2)
@@ -367,12 +367,12 @@ def _forward(sides: IntArray, speeds: FloatArray) -> tuple[FloatArray, float, fl
     direction = np.linalg.svd(speeds, full_matrices=False)[2][0]
     direction = direction * (np.sign(speeds.sum(axis=0) @ direction) or 1.0)
     along, across = speeds @ direction, speeds @ np.array([-direction[1], direction[0]])
-    alike = float(np.sum(along * np.abs(along)) / np.sum(along**2))
+    alike = float((along * np.abs(along)).sum() / (along**2).sum())
     pulls = np.bincount(sides, along * across)[np.unique(sides)]
     count = len(pulls)
     if count < _FEWEST_STOPS:
         return direction, np.nan, alike
-    scatter = np.sqrt(np.sum(pulls**2) * count / (count - 1)) / np.sum(along**2)
+    scatter = np.sqrt((pulls**2).sum() * count / (count - 1)) / (along**2).sum()
     return direction, float(scatter * student_isf(0.025, count - 1) / Z95), alike
 
 

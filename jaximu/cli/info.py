@@ -233,7 +233,7 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
     signals, poses = recording.signals, 0
     force = lengths_of(recording.accelerometer.si())
     timeless = any("stamps from --rate" in note for note in recording.notes)
-    near = bool(np.all(np.abs(force / STANDARD.value - 1) < _NEAR_GRAVITY))
+    near = bool((np.abs(force / STANDARD.value - 1) < _NEAR_GRAVITY).all())
     means = timeless and physical and len(force) <= _TABLE and near
     try:
         findings += plausibility(recording, STANDARD) if physical else ()
@@ -277,8 +277,6 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
 
 def _at_rest(recording: Recording, repaired: Recording, findings: list[str]) -> tuple[float, float, float, float]:
     """Seconds of a recording, those at rest in all and at a stretch, and when that begins; said among `findings`."""
-    import numpy as np
-
     from jaximu.recordings.recording import runs_of
     from jaximu.report.recording import signal_facts
 
@@ -297,7 +295,7 @@ def _at_rest(recording: Recording, repaired: Recording, findings: list[str]) -> 
     rates = rates[still] if recording.gyroscope is not None and recording.gyroscope.unit != "count" else rates[:0]
     size = lengths_of(rates)
     if len(rates) >= _PARTS and size.min() < _BIAS:  # a table's steady turn looks like a rest: the slowest is one
-        near = lengths_of(rates - rates[np.argmin(size)]) < _STILL["gyroscope"][0]
+        near = lengths_of(rates - rates[size.argmin()]) < _STILL["gyroscope"][0]
         findings += [_offset(rates[near])] if near.sum() >= _PARTS else []
     return length, rest, longest, float(start + first)
 
@@ -343,7 +341,7 @@ def _poses(recording: Recording, findings: list[str]) -> int:
     poses, still = len(intervals), (intervals[:, 1] - intervals[:, 0]).sum()
     findings.append(f"{poses} static poses, {still:.0f} s in all")
     force = Moments(recording.accelerometer).between(*intervals.T)[0]
-    axis = int(np.argmax(np.abs(force[0])))
+    axis = int(np.abs(force[0]).argmax())
     findings.append(
         f"in the first of them {'xyz'[axis]} points {'up' if force[0, axis] > 0 else 'down'}, as the accelerometer has "
         "it; poses and turns look the same with all its signs turned round: if it was the other way, add --axes=-f"

@@ -235,6 +235,6 @@ def _attitudes(tracks: Sequence[dict[str, Track]], poses: int) -> FloatArray:
     for track in (pair["gyroscope"] for pair in tracks):
         pose, row = np.unique(track.observation, return_index=True)
         inside = pose < poses
-        attitude = track.stimulus.attitude[row[inside]]
+        attitude = np.asarray(track.stimulus.attitude)[row[inside]]
         axes[pose[inside]] = rotation_matrix(attitude).reshape(-1, 9)
     return axes

@@ -122,7 +122,7 @@ def with_drift(
     known of the drift, and is in `covariance`; else it is estimated. The sigmas are as `about_biases` has them.
     """
     residual, jacobian = unwhitened(fitted, covariance)
-    whole, excess = covariance.dense(), fitted.excess
+    whole, excess = covariance.dense(), np.asarray(fitted.excess)
     used = whole.used > 0
     weighted = submatrix(whole.total(excess), used)
     total, sizes = fitted.covariance, fitted.sizes

@@ -220,7 +220,7 @@ class Fresh:
         share = np.eye(len(conditions)) - measurement.causes @ np.linalg.solve(covariance, measurement.causes).T
         left = share @ (covariance - columns @ spread @ columns.T) @ share.T
         new = spread + old.own**2 * old.gravity[:, None] * old.gravity
-        difference = fitted.values - old.values
+        difference = np.asarray(fitted.values) - old.values
         return cls(imu, difference, new, new + old.covariance, share @ conditions, left, bool(fitted.converged))
 
     @classmethod

@@ -57,7 +57,7 @@ def advance(known: Knowledge, rows: WhiteRows) -> tuple[Knowledge, Eliminated, f
     here, shared = known.root[:, :n], known.root[:, n:]
     old = np.concatenate([here, np.zeros((n + m, n)), shared, known.right[:, None]], axis=1)
     new = np.concatenate([rows.before, rows.after, rows.shared, rows.right[:, None]], axis=1)
-    whole = np.linalg.qr(np.concatenate([old, new]), mode="r")
+    whole = np.asarray(np.linalg.qr(np.concatenate([old, new]), mode="r"))
     gone, rest, last = whole[:n], whole[n : 2 * n + m], whole[2 * n + m :, -1]
     eliminated = Eliminated(gone[:, :n], gone[:, n:-1], gone[:, -1])
     return Knowledge(rest[:, n:-1], rest[:, -1]), eliminated, float(last @ last)

@@ -40,8 +40,8 @@ class FleetUnit:
         if data.slow is not None:  # it ties intervals, of which padding would make others
             return data
         poses, interval = np.asarray(data.poses.mask), np.asarray(data.turns.interval)
-        samples = int(np.max(np.flatnonzero(interval.any(axis=0)), initial=0)) + 1 if self.gyroscope else 1
-        last = int(np.max(np.flatnonzero(poses), initial=0)) + 1
+        samples = int(np.flatnonzero(interval.any(axis=0)).max(initial=0)) + 1 if self.gyroscope else 1
+        last = int(np.flatnonzero(poses).max(initial=0)) + 1
         return data.widened(_padded(last, 8), _padded(samples, 32) if self.gyroscope else 1)
 
 

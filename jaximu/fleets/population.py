@@ -85,10 +85,10 @@ class Population:
     def shrink(self, values: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the posterior means (n, p) and covariances (n, p, p) of estimates (n, p) with theirs (n, p, p)."""
         total = self.covariance + covariances
-        gain = np.swapaxes(np.linalg.solve(total, np.broadcast_to(self.covariance, total.shape)), 1, 2)
+        gain = np.linalg.solve(total, np.broadcast_to(self.covariance, total.shape)).swapaxes(1, 2)
         posterior = self.covariance - gain @ self.covariance
         mean = self.mean + np.einsum("nij,nj->ni", gain, values - self.mean)
-        return mean, (posterior + np.swapaxes(posterior, 1, 2)) / 2
+        return mean, (posterior + posterior.swapaxes(1, 2)) / 2
 
     def distances(self, values: FloatArray, covariances: FloatArray) -> FloatArray:
         """Return the squared distances (n,) from the population, χ² with p degrees for units that belong."""
@@ -229,7 +229,7 @@ def estimate_population(names: Sequence[Name], values: FloatArray, covariances: 
             break
         kept = belongs
         mean, covariance = _maximise(values[kept], covariances[kept], mean, covariance)
-    return Population(tuple(names), mean, covariance, np.std(values[kept], axis=0, ddof=1), int(kept.sum()))
+    return Population(tuple(names), mean, covariance, values[kept].std(axis=0, ddof=1), int(kept.sum()))
 
 
 def _maximise(values, covariances, mean, covariance):
@@ -244,7 +244,7 @@ def _maximise(values, covariances, mean, covariance):
         summed = rest.T @ rest + count * covariance - covariance @ weights.sum(axis=0) @ covariance
         # p units without correlations: what keeps the matrix regular when there are hardly more units than parameters
         fresh = (summed + size * np.diag(np.diagonal(summed) / count)) / (count + size)
-        change = np.max(np.abs(np.sqrt(np.diagonal(fresh) / np.diagonal(covariance)) - 1))
+        change = np.abs(np.sqrt(np.diagonal(fresh) / np.diagonal(covariance)) - 1).max()
         mean, covariance = better, fresh
         if change < 1e-3:
             break
@@ -377,7 +377,7 @@ def _strangers(path: Path, gyroscope: bool, population: Population, shifts: Shif
         for index in np.flatnonzero(p_values < LEVEL):
             variance = np.diagonal(units.covariances[index])
             z = (centred[index] - population.mean) / np.sqrt(np.diagonal(population.covariance) + variance)
-            worst = np.argsort(-np.abs(z))[:3]
+            worst = (-np.abs(z)).argsort()[:3]
             named = tuple((population.names[k], float(units.values[index, k]), float(z[k])) for k in worst)
             row = units.rows[index]
             strangers.append(Stranger(row["device"], row["file"], float(min(1.0, p_values[index])), named))
@@ -447,7 +447,7 @@ class _Groups:
                 values[members] = (values[members] - np.median(values[members], axis=0)) * stretch
             if np.isfinite(years[members]).any():
                 years[members] -= np.nanmedian(years[members])
-        order = np.argsort(years)[: int(np.isfinite(years).sum())]
+        order = years.argsort()[: int(np.isfinite(years).sum())]
         earlier, later = order[: len(order) // 2], order[(len(order) + 1) // 2 :]
         apart = years[later] - years[earlier]
         if not (apart > 0).any():
@@ -508,7 +508,7 @@ def _causes(
     """
     lots = len(groups.names)
     questions = np.array([lots * parameters] * lots + [parameters] * groups.dated, float)
-    freedom = max(1, int(np.sum(weight > 0)) - lots - 2)
+    freedom = max(1, int((weight > 0).sum()) - lots - 2)
 
     def p_value(z: FloatArray, causes) -> FloatArray:
         return np.minimum(1.0, 2 * scipy.stats.t.sf(np.abs(z), freedom) * questions[causes])
@@ -574,7 +574,7 @@ def _shared_effects(units: _Units) -> list[Difference]:
         shown = np.array([effect in (row["effects"] or ()) for row in units.rows])
         for group in groups:
             inside, outside = diagnosed & (lots == group), diagnosed & (lots != group)
-            table = [[int(np.sum(shown & side)), int(np.sum(~shown & side))] for side in (inside, outside)]
+            table = [[int((shown & side).sum()), int((~shown & side).sum())] for side in (inside, outside)]
             p_value = float(scipy.stats.fisher_exact(table, "greater")[1]) * len(names) * len(groups)
             if p_value < LEVEL:
                 text = (

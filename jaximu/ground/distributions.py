@@ -6,7 +6,7 @@ import scipy
 
 def rms(values) -> float:
     """Return the root mean square of numbers of any shape."""
-    return float(np.sqrt(np.mean(np.square(values))))
+    return float(np.sqrt(np.square(values).mean()))
 
 
 def robust_sigma(errors, axis=None):
@@ -74,7 +74,7 @@ def kolmogorov_sf(values) -> tuple[float, float]:
     """
     ranked = scipy.special.ndtr(np.sort(values))
     count = len(ranked)
-    distance = float(max(np.max(np.arange(1, count + 1) / count - ranked), np.max(ranked - np.arange(count) / count)))
+    distance = float(max((np.arange(1, count + 1) / count - ranked).max(), (ranked - np.arange(count) / count).max()))
     return distance, float(scipy.special.kolmogorov((np.sqrt(count) + 0.12 + 0.11 / np.sqrt(count)) * distance))
 
 

@@ -30,7 +30,7 @@ def sigmas_of(covariance) -> FloatArray:
     return np.sqrt(variances_of(covariance))
 
 
-def submatrix(matrix, places):
+def submatrix(matrix, places) -> FloatArray:
     """Return the rows and columns of a matrix (n, n) at places (k,): (k, k)."""
     return matrix[np.ix_(places, places)]
 

@@ -241,7 +241,7 @@ class Kalibr(eqx.Module):
 
         Raises InputError if A is not zero: y = K u + b cannot hold a g-sensitivity; `to_g_sensitivity` returns it.
         """
-        if not isinstance(self.g_sensitivity, Tracer) and np.any(np.asarray(self.g_sensitivity)):
+        if not isinstance(self.g_sensitivity, Tracer) and np.asarray(self.g_sensitivity).any():
             raise InputError("A gain and a bias cannot hold a g-sensitivity (A is not zero): give it as an effect.")
         gain_accel = self.accel_matrix @ self.body_rotation
         gain_gyro = self.gyro_matrix @ self.gyro_rotation @ self.body_rotation
@@ -267,8 +267,8 @@ def rotate_body_frame(gain_accel: Matrix, gain_gyro: Matrix, rotation: Matrix) -
     """
     if not isinstance(rotation, Tracer):
         values = np.asarray(rotation)
-        departure = np.max(np.abs(values @ np.swapaxes(values, -1, -2) - np.eye(3)), initial=0.0)
-        if not departure <= _SINGULAR or np.any(np.linalg.det(values) < 0):
+        departure = np.abs(values @ values.swapaxes(-1, -2) - np.eye(3)).max(initial=0.0)
+        if not departure <= _SINGULAR or (np.linalg.det(values) < 0).any():
             raise InputError("The rotation of the body frame must be orthonormal with determinant +1.")
     return FrameChange(jnp.matmul(gain_accel, rotation), jnp.matmul(gain_gyro, rotation), jnp.asarray(rotation))
 
@@ -337,8 +337,8 @@ def _refuse(matrix: Matrix, wrong: Callable[[np.ndarray], np.ndarray], message: 
     """Raise InputError where the matrix is wrong, its rows scaled to unit length (zero rows stay); not in a trace."""
     if isinstance(matrix, Tracer):
         return
-    values = np.asarray(matrix, np.float64)
-    if not np.all(np.isfinite(values)):
+    values = np.asarray(matrix, float)
+    if not np.isfinite(values).all():
         raise InputError("A gain or bias in another convention must be finite, but it holds inf or NaN.")
     norm = np.linalg.norm(values, axis=-1, keepdims=True)
     if np.any(wrong(values / np.where(norm > 0, norm, 1.0))):

@@ -72,16 +72,16 @@ class AxisNoise:
             - self.integrated(a[None, :] - a[:, None])
             - self.integrated(b[None, :] - b[:, None])
         )
-        return np.asarray(np.moveaxis(parts / ((b - a)[:, None] * (b - a))[..., None], -1, 0), np.float64)
+        return np.asarray(np.moveaxis(parts / ((b - a)[:, None] * (b - a))[..., None], -1, 0), float)
 
     def whitening(self, start: ArrayLike, stop: ArrayLike) -> FloatArray:
         """Return W (3, n, n), lower triangular, that makes the means over n intervals independent, of variance one."""
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance(start, stop))), np.float64)
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance(start, stop))), float)
 
     def allan_variance(self, tau: ArrayLike) -> FloatArray:
         """Return the Allan variance (n, 3) at averaging times (n,), s: (4 V(τ) − V(2τ)) / 2τ², V = 2G."""
         tau = np.asarray(tau, float)
-        return np.asarray((4 * self.integrated(tau) - self.integrated(2 * tau)) / tau[..., None] ** 2, np.float64)
+        return np.asarray((4 * self.integrated(tau) - self.integrated(2 * tau)) / tau[..., None] ** 2, float)
 
     def drift(self) -> AxisNoise:
         """Return the slow bias alone, without white noise and quantisation."""
@@ -134,7 +134,7 @@ def _fitted(
     A low-pass filter in the sensor bends the spectrum as no sum of these terms does, and its high frequencies, known
     best, would dictate the low ones.
     """
-    mean = np.maximum(mean, max(1e-9 * float(np.max(mean, initial=0.0)), 1e-24))  # coarse steps may leave no scatter
+    mean = np.maximum(mean, max(1e-9 * float(mean.max(initial=0.0)), 1e-24))  # coarse steps may leave no scatter
     sizes = _non_negative(expected, mean, counts, times)
     frequency = (edges[:-1] + edges[1:]) / 2 / duration
     felt = frequency <= _FELT
@@ -167,15 +167,15 @@ def _non_negative(expected: FloatArray, mean: FloatArray, counts: IntArray, time
         weight = np.sqrt(counts) / spectrum
         columns, target = (felt * weight).T, mean * weight
         if sizes.any():
-            flicker = np.sum(sizes[slow[:-1]]) / max(len(slow) - 1, 1)
-            level = max(flicker, 1e-3 * np.max(sizes[2:], initial=0.0))
+            flicker = sizes[slow[:-1]].sum() / max(len(slow) - 1, 1)
+            level = max(flicker, 1e-3 * sizes[2:].max(initial=0.0))
             columns = np.concatenate([columns, alike / level]) if level else columns
             target = np.concatenate([target, np.zeros(len(columns) - len(target))])
         scale = np.linalg.norm(columns, axis=0)
         scale[scale == 0] = 1
         sizes = (scipy.optimize.nnls(columns / scale, target)[0] / scale)[:terms]
         before, spectrum = spectrum, sizes @ expected
-        if np.max(np.abs(spectrum / before - 1)) < 1e-6:
+        if np.abs(spectrum / before - 1).max() < 1e-6:
             break
     return sizes
 
@@ -205,4 +205,4 @@ def _expectations(samples: int, rate: float) -> tuple[IntArray, FloatArray, Floa
         # E|X|²/n of n samples of the autocovariance c is Σ (1 − |k|/n) c(k) e^{−iωk}, leakage and aliasing included
         weighted = share * np.exp(-lag / (rate * time))
         rows.append(binned(2 * np.fft.rfft(weighted).real - weighted[0]))
-    return edges, np.asarray(times, np.float64), np.stack(rows)
+    return edges, np.asarray(times, float), np.stack(rows)

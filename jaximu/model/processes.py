@@ -281,7 +281,7 @@ FLICKER_VARIANCE = 2 * math.log(2) / math.pi
 def correlation_times(shortest: float, longest: float) -> FloatArray:
     """Return the correlation times (s) of Gauss–Markov processes that together are flicker noise, `RATIO` apart."""
     count = 1 + max(0, math.ceil(np.log(longest / shortest) / np.log(RATIO)))
-    return np.asarray(shortest * RATIO ** np.arange(count), np.float64)
+    return np.asarray(shortest * RATIO ** np.arange(count), float)
 
 
 @dataclass(frozen=True)
@@ -335,7 +335,7 @@ def _innovations(correlation_times: tuple[float, ...], interval: float):
     excess, weight = 2 * np.sinh(pole / 2) ** 2, MEMBER_VARIANCE * np.sinh(pole)  # cosh p − 1, and the numerators
 
     def imbalance(logarithm: float) -> float:
-        return float(np.sum(weight / (excess - np.exp(logarithm))))
+        return float((weight / (excess - np.exp(logarithm))).sum())
 
     zeros = []
     for high, low in pairwise(np.log(excess)):
@@ -344,8 +344,8 @@ def _innovations(correlation_times: tuple[float, ...], interval: float):
     zero = 2 * np.arcsinh(np.sqrt(np.exp(zeros) / 2))
     decay = np.exp(-pole)
     nyquist = np.sum(weight / (excess + 2))  # the spectrum at cos ω = −1, where nothing cancels: |H|² there
-    deviation = np.sqrt(nyquist) * np.prod(1 + decay) / np.prod(1 + np.exp(-zero))
-    residues = [np.prod(np.expm1(p - zero) / np.expm1(p - np.delete(pole, i))) for i, p in enumerate(pole)]
+    deviation = np.sqrt(nyquist) * (1 + decay).prod() / (1 + np.exp(-zero)).prod()
+    residues = [(np.expm1(p - zero) / np.expm1(p - np.delete(pole, i))).prod() for i, p in enumerate(pole)]
     gain = deviation * decay * np.array(residues)
     values, vectors = np.linalg.eigh(np.outer(gain, gain) / -np.expm1(-np.add.outer(pole, pole)))
     root = vectors * np.sqrt(np.clip(values, 0.0, None))

@@ -48,7 +48,7 @@ class LinearSystem(eqx.Module):
         for k in range(length):
             forced[..., k, : k + 1] = np.moveaxis(response[..., k::-1, :], -1, -2)
         driven = np.moveaxis(pushes[..., ::-1, :, :], -3, -1)  # (..., s, m, length)
-        return BlockSystem(power, np.swapaxes(driven, -3, -2), free[..., :length, :], forced)
+        return BlockSystem(power, driven.swapaxes(-3, -2), free[..., :length, :], forced)
 
 
 def linear_system(
@@ -101,8 +101,8 @@ def run(system: BlockSystem, state: FloatArray, draws: FloatArray) -> tuple[Floa
     """
     length = system.output.shape[-2]
     shaped = draws.reshape(*draws.shape[:-1], draws.shape[-1] // length, length)
-    local = np.sum(shaped @ np.swapaxes(system.through, -1, -2), axis=-3)
-    pushes = np.sum(shaped @ np.swapaxes(system.drive, -1, -2), axis=-3)
+    local = (shaped @ np.swapaxes(system.through, -1, -2)).sum(axis=-3)
+    pushes = (shaped @ np.swapaxes(system.drive, -1, -2)).sum(axis=-3)
     states = np.empty((pushes.shape[-2], *state.shape))
     for block, push in enumerate(np.moveaxis(pushes, -2, 0)):
         states[block] = state

@@ -173,7 +173,7 @@ class Consequences(Result, Document, page="consequences"):
 
 def position(variances: FloatArray) -> FloatArray:
     """Return the error of position in space (T,), m, from variances (T, 9)."""
-    return np.sqrt(np.sum(variances[:, :3], axis=1))
+    return np.sqrt(variances[:, :3].sum(axis=1))
 
 
 class Run(eqx.Module):

@@ -130,7 +130,7 @@ class ModelledErrors:
         first = _spread(np.arange(0, len(intervals) - size + 1, size))
         rows = first[:, None] + np.arange(size)
         start = np.cumulative_sum(intervals, include_initial=True)[first]
-        rates, forces = (samples[rows] for samples in (stimulus.angular_rate, stimulus.specific_force))
+        rates, forces = (np.asarray(samples)[rows] for samples in (stimulus.angular_rate, stimulus.specific_force))
         return Stretches(rates, forces, intervals[rows], start, rows)
 
     @cached_property
@@ -529,7 +529,7 @@ class _Length(NamedTuple):
 
 def _squared(root: FloatArray) -> FloatArray:
     """R Rᵀ (n, m, m) of roots R (n, m, p)."""
-    return root @ np.swapaxes(root, 1, 2)
+    return root @ root.swapaxes(1, 2)
 
 
 def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: float) -> _Length:
@@ -583,7 +583,7 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
             if of_kind.any() and kind != f"{triad} bias":
                 parts[kind] = _squared(moved[..., of_kind] @ root_of(submatrix(covariance, of_kind)))
         terms[triad] = {name: covariances[:, rows, rows] for name, covariances in parts.items()}
-    return _Length(stretches, spread, moment, roots, whole, moved @ root_of(covariance), terms, block)
+    return _Length(stretches, spread, moment, roots, np.asarray(whole), moved @ root_of(covariance), terms, block)
 
 
 def _measured_part(stretches: Stretches, spread: dict[tuple[str, str], FloatArray], block: IntArray) -> _Length:
@@ -664,7 +664,7 @@ def _with_interval(
 ) -> tuple[float, float, float]:
     """Return m and its interval for which the NEES of an error is one, where m² white + known is assumed of it."""
     inverse = np.linalg.inv(np.linalg.cholesky(white))
-    share, turn = np.linalg.eigh(inverse @ known @ np.swapaxes(inverse, 1, 2))
+    share, turn = np.linalg.eigh(inverse @ known @ inverse.swapaxes(1, 2))
     share = np.maximum(share, 0.0)
     basis = np.swapaxes(turn, 1, 2) @ inverse
     square = np.einsum("nai,nij,naj->na", basis, moment, basis, optimize=True)
@@ -674,11 +674,11 @@ def _with_interval(
         left = np.array([np.sqrt(_solved(square[block != omitted], share[block != omitted])) for omitted in blocks])
         left = np.log(np.maximum(left, 1e-3 * max(value, 1e-3)))
         count = len(blocks)
-        sigma = float(np.sqrt((count - 1) / count * np.sum((left - left.mean()) ** 2)))
+        sigma = float(np.sqrt((count - 1) / count * ((left - left.mean()) ** 2).sum()))
         wide = float(np.exp(min(scipy.special.stdtrit(count - 1, 0.975) * sigma, 50.0)))
         return value, value / wide, value * wide
     projected = basis @ root
-    value = float(np.sqrt(_solved(square + np.sum(projected**2, axis=2), share)))
+    value = float(np.sqrt(_solved(square + (projected**2).sum(axis=2), share)))
     numbers = rng.standard_normal((draws, root.shape[2]))
     drawn = square + np.einsum("nap,dp->dna", projected, numbers, optimize=True) ** 2
     low, high = np.quantile(np.sqrt(_solved(drawn, share)), (0.025, 0.975))
@@ -687,11 +687,11 @@ def _with_interval(
 
 def _solved(square: FloatArray, share: FloatArray) -> FloatArray:
     """Return x = m² (...) for which the mean of square / (x + share), (..., n, 3), is one; zero where none is."""
-    high = np.mean(square, axis=(-2, -1))
+    high = square.mean(axis=(-2, -1))
     low = np.zeros_like(high)
     for _ in range(60):
         middle = (low + high) / 2
-        above = np.mean(square / np.maximum(middle[..., None, None] + share, 1e-300), axis=(-2, -1)) > 1
+        above = (square / np.maximum(middle[..., None, None] + share, 1e-300)).mean(axis=(-2, -1)) > 1
         low, high = np.where(above, middle, low), np.where(above, high, middle)
     return high
 

@@ -93,7 +93,7 @@ class Trajectory:
     @property
     def times(self) -> FloatArray:
         """The reported times (T,), s from the start."""
-        return np.round(np.cumsum(self.intervals)[self.every - 1 :: self.every], 9)  # not 0.99…
+        return np.cumsum(self.intervals)[self.every - 1 :: self.every].round(9)  # not 0.99…
 
     @property
     def interval(self) -> float:
@@ -114,8 +114,8 @@ class Trajectory:
         excess = {}
         for triad, values in known:
             whole = np.asarray(values)[: len(self.intervals) // _WINDOW * _WINDOW].reshape(-1, _WINDOW, 3)
-            measured = np.mean(np.einsum("k,nki->ni", weight, whole) ** 2) / np.sum(weight**2)
-            white = np.mean(np.square(density[triad])) / self.interval
+            measured = (np.einsum("k,nki->ni", weight, whole) ** 2).mean() / (weight**2).sum()
+            white = np.square(density[triad]).mean() / self.interval
             excess[triad] = max(float(measured / white) - 1.0, 0.0)
         return excess
 
@@ -123,10 +123,10 @@ class Trajectory:
         """Raise `NotPossibleError` where the path leaves a sensor's range, by triad in m/s² and rad/s."""
         for triad, limit in limits.items():
             gyroscope = triad == "gyroscope"
-            felt = self.stimulus.angular_rate if gyroscope else self.stimulus.specific_force
+            felt = np.asarray(self.stimulus.angular_rate if gyroscope else self.stimulus.specific_force)
             beyond = np.abs(felt) > limit
             if beyond.any():
-                row, axis = (int(index[0]) for index in np.nonzero(beyond))
+                row, axis = (int(index[0]) for index in beyond.nonzero())
                 factor, unit = (np.degrees(1.0), "°/s") if gyroscope else (1.0, "m/s²")
                 raise NotPossibleError(
                     f"the path leaves the {triad}'s range of ±{factor * limit:.4g} {unit}: {'xyz'[axis]} feels "
@@ -248,7 +248,7 @@ def of_recording(recording: Recording, calibration: Calibration, site: Place, du
     words = f"{min(duration, float(time[-1]) - first):.4g} s of the motion recorded in {Path(recording.name).name}"
     steps = np.diff(time[kept])
     bend = np.diff(steps[steps < 2.5 * np.median(steps)])  # of white jitter its variance is six times
-    jitter = float(np.sqrt(np.mean(bend**2) / 6)) if len(bend) else 0.0
+    jitter = float(np.sqrt((bend**2).mean() / 6)) if len(bend) else 0.0
     start = _start(attitude, site, gravity)
     return Trajectory(start, stimulus, np.gradient(time)[kept], words, tuple(notes), True, jitter).cut()
 
@@ -269,13 +269,13 @@ def _first_rest(
     level = np.abs(lengths_of(force_mean) - gravity) < _STILL[0]
     calm = still.all(axis=0) & level & (lengths_of(rate_mean) < _STILL[1])
     if not calm.any():
-        quiet = int(np.argmin(spread.sum(axis=(0, 2))))
+        quiet = int(spread.sum(axis=(0, 2)).argmin())
         raise NotPossibleError(
             f"{where} has neither a rest of a second to start from nor an attitude (attitude_w, …): hold the unit "
             "still before it moves, or log its attitude. In its quietest second the calibrated unit reads "
             f"{np.linalg.norm(force_mean[quiet]):.2f} m/s² and {np.degrees(np.linalg.norm(rate_mean[quiet])):.2f} °/s; "
             "if it was at rest then, the calibration is not this unit's."
         )
-    first = int(np.argmax(calm))
-    length = int(np.argmin(np.append(calm[first:], False)))
+    first = int(calm.argmax())
+    length = int(np.append(calm[first:], False).argmin())
     return float(time[0] + first), float(time[0] + first + length)

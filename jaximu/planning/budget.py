@@ -178,7 +178,7 @@ class Budget(Result, Document, page="budget"):
         """Return the sources, dominant first: by their mean share of the parameters' variances."""
         share = self.sigma**2 / np.maximum(np.sum(self.sigma**2, axis=0), 1e-300)
         weight = share[:, self.determined].sum(axis=1)
-        return [int(row) for row in np.argsort(-weight, kind="stable")]
+        return [int(row) for row in (-weight).argsort(kind="stable")]
 
     def document(self) -> Json:
         """Return the budget as the JSON document of schema `jaximu.budget/1`."""
@@ -283,7 +283,7 @@ def _determined(jacobian: FloatArray, scale: FloatArray, sigma: FloatArray) -> B
 
 
 def _mean_square(values: FloatArray) -> FloatArray:
-    return np.mean(np.square(values), axis=0)
+    return np.square(values).mean(axis=0)
 
 
 def _residual(unit: Imu, data) -> Array:
@@ -338,7 +338,7 @@ def _expected_excess(
     The restricted likelihood's scoring (`jaximu.estimation.covariance.scored`) with the residuals' expected
     squares: errors scatter the mean outputs by `scattered` @ standard normal draws.
     """
-    measured = block_diag(*stations.accelerometer_covariance, *stations.gyroscope_covariance)
+    measured = np.asarray(block_diag(*stations.accelerometer_covariance, *stations.gyroscope_covariance))
     units, excess = units.reshape(len(units), -1), np.zeros(len(units))
 
     def whitening(excess: FloatArray) -> FloatArray:
@@ -348,10 +348,10 @@ def _expected_excess(
         weights = whitening(excess)
         basis = np.linalg.qr(weights @ design)[0].T @ weights
         inverse = weights.T @ weights - basis.T @ basis
-        gradient = units @ (np.sum((inverse @ scattered) ** 2, axis=1) - np.diagonal(inverse))
+        gradient = units @ (((inverse @ scattered) ** 2).sum(axis=1) - np.diagonal(inverse))
         information = units @ inverse**2 @ units.T
         before, excess = excess, np.asarray(scored(excess, gradient, information))
-        if np.all(np.abs(excess - before) <= 1e-4 * (1 + before)):
+        if (np.abs(excess - before) <= 1e-4 * (1 + before)).all():
             break
     return excess, whitening(np.zeros(len(units))) @ design
 
@@ -430,9 +430,9 @@ def _goal(result: Budget, what: str, text: str) -> Goal:
     indices, size = goal_of(what, text, result.names, result.imu, f"{result.source}: ")
     unit = result.units[indices[0]]
     total = np.where(result.determined, result.total, np.inf)[indices]
-    worst = indices[int(np.argmax(total))]
+    worst = indices[int(total.argmax())]
     names = tuple(result.names[index] for index in indices)
-    reached = bool(np.max(total) <= size)
+    reached = bool(total.max() <= size)
     alone, together = (), None
     if not reached and np.isfinite(total).all():
         ranked = sorted(range(len(result.sources)), key=lambda row: -result.sigma[row, worst])
@@ -449,6 +449,6 @@ def _need(result: Budget, rows: tuple[int, ...], indices: Sequence[int], goal: f
     names = tuple(result.sources[row].name for row in rows)
     mine = np.sum(result.sigma[list(rows)][:, indices] ** 2, axis=0)
     left = goal**2 - (result.total[indices] ** 2 - mine)
-    if np.any(left <= 0):
+    if (left <= 0).any():
         return Need(names, None)
-    return Need(names, max(1.0, float(np.sqrt(np.max(mine / left)))))
+    return Need(names, max(1.0, float(np.sqrt((mine / left).max()))))

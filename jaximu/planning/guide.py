@@ -123,7 +123,7 @@ class Guide:
         signal = recording.accelerometer
         still = float(length[-1]) if len(rests) and signal.time[-1] - rests[-1, 1] < _REACHED else 0.0
         taken = rests[long]
-        if len(taken) != len(self._seen) or np.any(np.abs(taken[:, 0] - self._seen[:, 0]) > _REACHED):
+        if len(taken) != len(self._seen) or (np.abs(taken[:, 0] - self._seen[:, 0]) > _REACHED).any():
             self._seen = taken
             self._renew(recording)
         short = float(length[-1]) if len(rests) and not long[-1] and not still else 0.0

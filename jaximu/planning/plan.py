@@ -151,7 +151,7 @@ class Known:
         density = np.mean(poses.accelerometer_covariance * (poses.stop - poses.start)[:, None, None], axis=0)
         # variances as traces: the next rests and turns have other durations, their excess is the same
         excess = calibration.excess
-        duration = float(np.sum(turned, axis=1).mean()) if len(turned) else 0.0
+        duration = float(turned.sum(axis=1).mean()) if len(turned) else 0.0
         return replace(
             known,
             accelerometer_noise=density,
@@ -525,7 +525,7 @@ def _prior(known: Known, imu: Imu, parameters: Parameters, by_gravity: FloatArra
         np.linalg.cholesky(total)
     except np.linalg.LinAlgError as error:
         raise InputError(f"{known.source}: the covariance of its parameters is not positive definite.") from error
-    return np.linalg.inv(total)
+    return np.asarray(np.linalg.inv(total), float)
 
 
 _UPPER = tuple(name for name in names_of(Imu.nominal()) if not without_equipment(name))
@@ -633,7 +633,7 @@ def _rounded(design: Design, equipment: Equipment) -> Design:
         _attitudes(np.array([round_direction(direction, step) for direction in up_of(part)]))
         for part in (attitude, design.axis)
     )
-    return Design(up, axis, np.radians(np.round(np.degrees(design.rate), 0)))
+    return Design(up, axis, np.radians(np.degrees(design.rate).round(0)))
 
 
 def _poses(design: Design, equipment: Equipment) -> tuple[Pose, ...]:

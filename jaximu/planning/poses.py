@@ -26,7 +26,7 @@ def turned_to(attitude: FloatArray, up: FloatArray) -> FloatArray:
 
 def _polar(up: FloatArray) -> tuple[int, float, float, float]:
     """The axis nearest to "up", its sign, the angle to it and the direction in which "up" leaves it (rad)."""
-    axis = int(np.argmax(np.abs(up) + [0, 1e-9, 2e-9]))  # halfway between two, rounding must not decide
+    axis = int((np.abs(up) + [0, 1e-9, 2e-9]).argmax())  # halfway between two, rounding must not decide
     sign = 1.0 if up[axis] > 0 else -1.0
     _, j, k = np.roll(up, -axis)
     return axis, sign, float(np.arctan2(np.hypot(j, k), abs(up[axis]))), float(np.arctan2(k, j))
@@ -80,14 +80,14 @@ def heading_of(attitude: FloatArray) -> float:
 
 def short_order(up: FloatArray) -> IntArray:
     """Return an order of directions (P, 3) with little turning between neighbours: nearest next, then 2-opt."""
-    angle = np.arccos(np.clip(up @ up.T, -1, 1))
-    order = [int(np.argmax(up[:, 2]))]
+    angle = np.arccos((up @ up.T).clip(-1, 1))
+    order = [int(up[:, 2].argmax())]
     while len(order) < len(up):
         left = [index for index in range(len(up)) if index not in order]
         order.append(min(left, key=lambda index: angle[order[-1], index]))
 
     def length(order):
-        return float(np.sum(angle[order[:-1], order[1:]]))
+        return float(angle[order[:-1], order[1:]].sum())
 
     improved = True
     while improved:

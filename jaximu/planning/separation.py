@@ -206,7 +206,7 @@ def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict
 
 
 def _basis(columns: NDArray[np.floating]) -> FloatArray:
-    return orth(np.asarray(columns, np.float64), rcond=1e-6)
+    return orth(np.asarray(columns, float), rcond=1e-6)
 
 
 def _detected(noncentrality: float, freedom: int, level: float) -> float:

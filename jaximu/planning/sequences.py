@@ -187,7 +187,7 @@ def _merged(rows: WhiteRows) -> WhiteRows:
         # columns: the state between, which goes, then the first state, the next one, the numbers
         old = np.concatenate([whole[:, n : 2 * n], whole[:, :n], np.zeros((len(whole), n)), whole[:, 2 * n :]], axis=1)
         new = np.concatenate([before, np.zeros_like(before), after, shared, right[:, None]], axis=1)
-        whole = qr(np.concatenate([old, new]), mode="r")[0][n:, n:]
+        whole = np.asarray(qr(np.concatenate([old, new]), mode="r")[0])[n:, n:]
         whole = whole[: whole.shape[1]]
     return WhiteRows(whole[None, :, :n], whole[None, :, n : 2 * n], whole[None, :, 2 * n : -1], whole[None, :, -1])
 

@@ -414,7 +414,7 @@ def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...]
         scale = case.imu.triads()["gyroscope"].scales
         add("vibration", np.diag((shaken * scale[:, None] * during).ravel()), added + 3 * size)
     for name, covariances in (("noise", fast), ("bias_instability", slow)):
-        add(name, block_diag(*root_of(covariances)), added)
+        add(name, np.asarray(block_diag(*root_of(covariances))), added)
 
     return scheme, tuple(_source(errors, name, root) for name, root in roots.items() if root.size), notes
 
@@ -513,8 +513,8 @@ def _scheme(
     ends, axis, angle = np.zeros((size, 2), np.int64), np.zeros((size, 3)), np.full(size, np.inf)
     ends[:count], axis[:count] = stops.ends, [interval.vector for interval in intervals]
     angle[:count] = [interval.angle if interval.kind == "turn" else np.inf for interval in intervals]
-    pace = np.einsum("sqi,si->sq", stations.stimulus.angular_rate, axis) / angle[:, None]
-    done = (np.cumsum(pace, axis=1) - pace / 2) * (_durations(stations) / pace.shape[1])[:, None]
+    pace = np.einsum("sqi,si->sq", np.asarray(stations.stimulus.angular_rate), axis) / angle[:, None]
+    done = (pace.cumsum(axis=1) - pace / 2) * (_durations(stations) / pace.shape[1])[:, None]
     rms = _stated(errors, "vibration").get("rms", 0.0)
     power = np.where(stations.turn[:, None], rms**2, np.zeros_like(pace))
     return ErrorScheme(unit, effects, stations, motion, ends, done, pace, power, len(stops.up))

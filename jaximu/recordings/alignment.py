@@ -70,7 +70,7 @@ def signed_permutation(matrix: FloatArray) -> FloatArray:
     best, nearest = -np.inf, np.eye(3)
     for order in permutations(range(3)):
         entries = columns[order, range(3)]
-        total = np.sum(np.abs(entries))
+        total = np.abs(entries).sum()
         if total > best + 1e-12:
             best, nearest = total, np.zeros((3, 3))
             nearest[order, range(3)] = np.where(entries < 0, -1.0, 1.0)
@@ -221,9 +221,9 @@ def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatA
         for at in range(span):
             carried[:, at] = attitude.apply(force[rows[:, at]])
             attitude = attitude * Rotation.from_rotvec(sense * steps[:, at])
-        scatter.append(np.sum(np.var(carried, axis=1), axis=1))
+        scatter.append(np.var(carried, axis=1).sum(axis=1))
     better = np.log(scatter[0] / np.maximum(scatter[1], 1e-300))
-    return bool(np.mean(better > 0) > 0.9 and np.median(better) > np.log(1.5))
+    return bool((better > 0).mean() > 0.9 and np.median(better) > np.log(1.5))
 
 
 _TURN_SECONDS, _TURN_STEPS, _MOST = 10.0, 128, 24
@@ -303,11 +303,11 @@ def carried(
     # f' = Q Rᵀ Qᵀ f, with Q from the gyroscope's axes to the accelerometer's
     before, after = (np.einsum("qji,tj->qti", ARRANGEMENTS, part) for part in (up[used], up[used + 1]))
     cosine = np.einsum("qti,stji,qtj->sqt", after, back, before)
-    error = np.quantile(np.arccos(np.clip(cosine, -1.0, 1.0)), _MOST_TURNS, axis=2)
+    error = np.quantile(np.arccos(cosine.clip(-1.0, 1.0)), _MOST_TURNS, axis=2)
     # of factors that do as well the one nearest to none
     best = error.min(axis=1)
     alike = np.flatnonzero(best < best.min() + _ROUGH_ANGLE)
-    factor = factors[alike[np.argmin(np.abs(np.log(np.abs(factors[alike]))) + 1e-9 * best[alike])]]
+    factor = factors[alike[(np.abs(np.log(np.abs(factors[alike]))) + 1e-9 * best[alike]).argmin()]]
     return Carried(float(factor), float(best.min()), len(used))
 
 
@@ -422,13 +422,13 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
         lag = line[0] + line[1] * (blocks.centre - middle)
         turned = blocks.turned(lag)
         columns = _columns(levers, turned)
-        matrix = np.asarray(np.linalg.lstsq(columns, changes.ravel(), rcond=1e-6)[0], np.float64)
+        matrix = np.asarray(np.linalg.lstsq(columns, changes.ravel(), rcond=1e-6)[0], float)
         # where the rate hardly changes, errors of the accelerometer would pass for lags
         columns = np.hstack([columns, _accelerometer_columns(blocks, turned @ matrix.reshape(3, 3).T)])
         rest = changes.ravel() - columns @ np.linalg.lstsq(columns, changes.ravel(), rcond=1e-6)[0]
         by_lag = _columns(levers, (blocks.turned(lag + step) - blocks.turned(lag - step)) / (2 * step)) @ matrix
         information, slope = (np.add.reduceat(by_lag * part, 3 * edges[:-1]) for part in (by_lag, rest))
-        shifts = np.clip(slope / np.maximum(information, 1e-300), -2 * step, 2 * step)
+        shifts = (slope / np.maximum(information, 1e-300)).clip(-2 * step, 2 * step)
         good = information > 1e-3 * information.max()
         if good.sum() < 3:
             return None
@@ -440,7 +440,7 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
         missed = shifts[good] - design @ change
         line = line + change
     freedom = int(good.sum()) - 2
-    spread = np.sum(weight * missed**2) / freedom
+    spread = (weight * missed**2).sum() / freedom
     # parts that agree by chance are no surer than the noise of their samples lets them be
     spread = max(spread * float(student_isf(0.025, freedom) / 1.96) ** 2, np.mean(rest**2))
     sigma, drift_sigma = np.sqrt(spread * np.diag(inverse))

@@ -35,7 +35,7 @@ class Attitude:
 
     def __post_init__(self) -> None:
         length = lengths_of(self.quaternion)
-        if np.mean(np.abs(length - 1) <= UNIT_LENGTH) < 0.5:
+        if (np.abs(length - 1) <= UNIT_LENGTH).mean() < 0.5:
             raise InputError(
                 f"{self.name}: its quaternions have the length {np.median(length):.4g} and not 1: the columns are "
                 "not a quaternion, or not in this order."
@@ -51,7 +51,7 @@ class Attitude:
         vectors = {name: values[kept] for name, values in vectors.items() if values is not None}
         notes = self.notes
         if not kept.all():
-            notes += (f"{self.name}: {np.sum(~kept)} of {len(kept)} rows hold no attitude and are left out.",)
+            notes += (f"{self.name}: {(~kept).sum()} of {len(kept)} rows hold no attitude and are left out.",)
         unit = self.quaternion[kept] / length[kept, None]
         flips = np.concatenate([[1.0], np.cumprod(np.sign(dot_rows(unit[1:], unit[:-1]) + 1e-12))])
         return replace(self, time=self.time[kept], quaternion=unit * flips[:, None], notes=notes, **vectors)

@@ -69,14 +69,14 @@ class Signal(Comparable):
                 "Observe it there (jaximu.observe), and trace what follows (jaximu.fit)."
             )
         # column by column: sums over the samples, the bulk of all work on a recording, are three times quicker
-        values = np.asarray(self.values, np.float64, order="F")
+        values = np.asarray(self.values, float, order="F")
         values = values[:, None] if values.ndim == 1 else values
         axes = values.shape[1]
         fill = object.__setattr__
-        fill(self, "time", np.asarray(self.time, np.float64))
+        fill(self, "time", np.asarray(self.time, float))
         fill(self, "values", values)
         for name, default in (("nominal_scale", 1.0), ("nominal_offset", 0.0)):
-            nominal = np.asarray(getattr(self, name), np.float64)
+            nominal = np.asarray(getattr(self, name), float)
             fill(self, name, np.array(np.broadcast_to(nominal if nominal.size else default, (axes,))))
         if self.time.shape != (len(values),):
             raise ValueError(f"{self.time.shape[0]} time stamps for {len(values)} samples")
@@ -98,8 +98,8 @@ class Signal(Comparable):
         """
         interval = np.diff(self.time)
         usual = np.median(interval)
-        longest = GAP * max(usual, np.mean(np.minimum(interval, 3 * usual)))
-        return float(1.0 / np.mean(interval[interval <= longest]))
+        longest = GAP * max(usual, np.minimum(interval, 3 * usual).mean())
+        return float(1.0 / interval[interval <= longest].mean())
 
     @property
     def edges(self) -> FloatArray:
@@ -498,7 +498,7 @@ def parse_axes(spec: str) -> dict[str, FloatArray]:
 
 def spelled_axes(matrix: FloatArray) -> str:
     """The text of a signed permutation (3, 3) as `axis_matrix` reads it: "x,-z,y"."""
-    columns = np.argmax(np.abs(matrix), axis=1)
+    columns = np.abs(matrix).argmax(axis=1)
     return ",".join("-" * bool(row[column] < 0) + "xyz"[column] for row, column in zip(matrix, columns, strict=True))
 
 

@@ -158,7 +158,7 @@ def _require_clock(entries: Sequence[ScheduleEntry], rate: Integral, bias: Float
         start, stop = (np.clip(edge + shift, rate.edges[0], rate.edges[-1] - 1e-3) for edge in span.T)
         turned, duration = rate.over(start, stop), np.maximum(stop - start, 1e-3)[:, None]
         shifted_bias = np.median(turned[rest] / duration[rest], axis=0)
-        return float(np.sum(weight * np.abs(turned - shifted_bias * duration - stated).sum(axis=1)))
+        return float((weight * np.abs(turned - shifted_bias * duration - stated).sum(axis=1)).sum())
 
     misfits = [misfit(shift) for shift in _SHIFTS]
     best = _SHIFTS[np.argmin(misfits)]
@@ -191,7 +191,7 @@ def _require_poses(recording: Recording, poses: Sequence[ScheduleEntry], where: 
         return
     read = unit_vectors(Integral(recording.accelerometer).over(*times_of(poses).T))
     stated = np.stack([pose.vector for pose in poses])
-    off = np.degrees(np.arccos(np.clip(dot_rows(read, stated), -1, 1)))
+    off = np.degrees(np.arccos(dot_rows(read, stated).clip(-1, 1)))
     if not (off > _OFF).any():
         return
     if (off > 180 - _OFF).all():
@@ -199,7 +199,7 @@ def _require_poses(recording: Recording, poses: Sequence[ScheduleEntry], where: 
             f'{where}: the accelerometer reads the opposite of "up" in every pose: it records minus the specific '
             "force; say so with --axes=-f."
         )
-    worst = int(np.argmax(off))
+    worst = int(off.argmax())
     same = (read @ read[worst] > math.cos(math.radians(5))) & (stated @ stated[worst] < math.cos(math.radians(_OFF)))
     alike = np.flatnonzero(same)
     text = f"{where}: {_label(poses[worst])}: the accelerometer reads "
@@ -260,7 +260,7 @@ def _neighbours(count: int, samples: float) -> tuple[IntArray, IntArray]:
 def _entries_of_attitude(recording: Recording, attitude: Signal) -> list[ScheduleEntry]:
     length = lengths_of(attitude.values)
     if (np.abs(length - 1) > UNIT_LENGTH).any():
-        worst = np.argmax(np.abs(length - 1))
+        worst = np.abs(length - 1).argmax()
         raise InputError(
             f"{recording.name}: the attitude at {attitude.time[worst]:.6g} s has the length {length[worst]:.4g}; a "
             "unit quaternion has the length 1."
@@ -298,7 +298,7 @@ def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray)
         )
     read = Integral(recording.accelerometer).over(*spans.T)
     size = np.abs(read)
-    axis = np.argmax(size, axis=1)
+    axis = size.argmax(axis=1)
     ups = np.sign(np.take_along_axis(read, axis[:, None], 1)) * np.eye(3)[axis]
     off = np.degrees(np.arccos(np.minimum(1.0, size.max(axis=1) / lengths_of(read))))
     if len(tilted := np.flatnonzero(off > _OFF)):

@@ -83,7 +83,7 @@ class Moments:
         values = values - self._origin  # sums of squares lose fewer digits around the mean
         self._sums, self._squares = np.zeros((2, 3, len(signal) + 1))  # an axis a row
         np.cumsum(values, axis=1, out=self._sums[:, 1:])
-        np.cumsum(np.square(values, out=values), axis=1, out=self._squares[:, 1:])
+        np.square(values, out=values).cumsum(axis=1, out=self._squares[:, 1:])
 
     def between(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
         """Mean (W, 3) and unbiased variance (W, 3) of the samples from `start` to before `stop`, and their number."""
@@ -111,7 +111,7 @@ def _floor(variance: FloatArray, moments: Moments) -> float:
 
 def _angles(vectors: FloatArray, others: FloatArray) -> FloatArray:
     """Angle (rad) between each vector and the other of its row."""
-    return 2 * np.arcsin(np.clip(lengths_of(unit_vectors(others) - unit_vectors(vectors)) / 2, 0, 1))
+    return 2 * np.arcsin((lengths_of(unit_vectors(others) - unit_vectors(vectors)) / 2).clip(0, 1))
 
 
 def _samples(signal: Signal, start: float, stop: float) -> slice:
@@ -191,7 +191,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     factors = THRESHOLDS if options.threshold is None else (options.threshold,)
     results = [runs(factor) for factor in factors]
     tried = tuple(
-        (float(factor), len(intervals), distinct, float(np.sum(np.diff(intervals))))
+        (float(factor), len(intervals), distinct, float(np.diff(intervals).sum()))
         for factor, (intervals, distinct) in zip(factors, results, strict=True)
     )
     # The lowest threshold that finds about all orientations there are without breaking poses in two.
@@ -235,18 +235,18 @@ def find_stops(recording: Recording) -> Segmentation | None:
             f"{recording.name}: no stop was found, at which a vehicle stands still for two seconds or more with less "
             "vibration than in motion. Record a drive with stops of ten seconds or more."
         )
-    tried = (float(np.exp(threshold)), len(intervals), 1, float(np.sum(np.diff(intervals))))
+    tried = (float(np.exp(threshold)), len(intervals), 1, float(np.diff(intervals).sum()))
     return Segmentation(recording, intervals, tried[0], (tried,), tuple(notes))
 
 
 def _parting(values: FloatArray) -> tuple[float, float]:
     """Return where values part best into two classes, and the share of their variance that lies between these."""
     values = np.sort(values)
-    sums, share = np.cumsum(values), np.arange(1, len(values)) / len(values)
+    sums, share = values.cumsum(), np.arange(1, len(values)) / len(values)
     mean = sums[-1] / len(values)
     between = (share * mean - sums[:-1] / len(values)) ** 2 / (share * (1 - share))
-    best = int(np.argmax(between))
-    return float(values[best : best + 2].mean()), float(between[best] / max(np.var(values), 1e-300))
+    best = int(between.argmax())
+    return float(values[best : best + 2].mean()), float(between[best] / max(values.var(), 1e-300))
 
 
 def _why_no_poses(intervals: FloatArray, duration: float, force: FloatArray, notes: Sequence[str]) -> str:
@@ -257,7 +257,7 @@ def _why_no_poses(intervals: FloatArray, duration: float, force: FloatArray, not
     )
     alternating = np.insert(force, np.arange(1, len(force)), np.median(force, axis=0), axis=0)
     off = _angles(alternating[:-1], alternating[1:]) if len(force) > 1 else np.zeros(1)
-    if np.quantile(off, 0.99) < _DISTINCT and np.sum(np.diff(intervals)) > 0.5 * duration:
+    if np.quantile(off, 0.99) < _DISTINCT and np.diff(intervals).sum() > 0.5 * duration:
         return (
             "1 static pose found: the unit lay in one orientation throughout. That shows its noise (jaximu allan) and, "
             f"with a temperature beside it, its drift (jaximu thermal). {record}"
@@ -320,12 +320,12 @@ def rest_statistics(
     """
     columns = [signal.values[_samples(signal, start, stop)].T for start, stop in intervals]
     counts = np.array([column.shape[1] for column in columns])
-    first = np.cumsum(counts) - counts
+    first = counts.cumsum() - counts
     values = np.concatenate(columns, axis=1)
     mean = np.add.reduceat(values, first, axis=1) / counts
-    squares = np.add.reduceat(np.square(values - np.repeat(mean, counts, axis=1)), first, axis=1)
+    squares = np.add.reduceat(np.square(values - mean.repeat(counts, axis=1)), first, axis=1)
     variances = (squares / counts).T / np.square(signal.nominal_scale)
-    total = np.sum(variances, axis=1)
+    total = variances.sum(axis=1)
     share = total / max(np.median(total), signal.rounding_variance)  # coarse steps may leave no scatter at all
     density, _ = _density(signal, [column for column, size in zip(columns, share, strict=True) if size < 2] or columns)
     factor = np.where(share > 1.5, share, 1.0)
@@ -346,8 +346,8 @@ def _across_gravity(signal: Signal, intervals: FloatArray, force: FloatArray, co
     onto = (signal.nominal_scale * up)[:, :, None] * (up / signal.nominal_scale)[:, None]
     columns = [signal.values[_samples(signal, start, stop)].T for start, stop in intervals]
     along, freedom = _density(signal, [part @ column for part, column in zip(onto, columns, strict=True)])
-    expected = np.mean(onto @ covariance @ onto.mT * np.diff(intervals)[:, :, None], axis=0)
-    scattered, stated = (np.sum(np.diagonal(part) / signal.nominal_scale**2) for part in (along, expected))
+    expected = (onto @ covariance @ onto.mT * np.diff(intervals)[:, :, None]).mean(axis=0)
+    scattered, stated = ((np.diagonal(part) / signal.nominal_scale**2).sum() for part in (along, expected))
     share = float(scattered / stated)
     if not freedom or share > 1 - _CHANCE * np.sqrt(2 / freedom):
         return covariance
@@ -366,7 +366,7 @@ def _density(signal: Signal, columns: Sequence[FloatArray]) -> tuple[FloatArray,
     best = _of_blocks(signal, columns, size)
     for factor in (2, 4):
         longer, freedom = _of_blocks(signal, columns, factor * size)
-        ratio = np.mean(np.diagonal(longer) / np.maximum(np.diagonal(best[0]), 1e-300))  # noise-free: no scatter
+        ratio = (np.diagonal(longer) / np.maximum(np.diagonal(best[0]), 1e-300)).mean()  # noise-free: no scatter
         if freedom and ratio < 1 - _CHANCE * np.sqrt(2 / (3 * freedom)):
             best = longer, freedom
     return best
@@ -385,7 +385,7 @@ def _of_blocks(signal: Signal, columns: Sequence[FloatArray], size: int) -> tupl
         scatter = deviations @ deviations.T / deviations.shape[1]
     else:  # no interval holds two blocks
         scatter = np.diag(np.median([np.var(column, axis=1) for column in columns], axis=0)) / size
-    return (scatter + 1e-3 * quantum) * size / signal.rate, int(np.sum(np.maximum(number - 1, 0)))
+    return (scatter + 1e-3 * quantum) * size / signal.rate, int(np.maximum(number - 1, 0).sum())
 
 
 def _rounding(signal: Signal, part: Segmentation) -> FloatArray:
@@ -401,7 +401,7 @@ def _rounding_of_means(signal: Signal, variances: FloatArray) -> FloatArray:
     and at most that of rounding itself.
     """
     rounding = signal.rounding_variance / 3
-    quiet = np.maximum(np.mean(variances, axis=1) / rounding - 1, 0.0)  # σ² over q²/12
+    quiet = np.maximum(variances.mean(axis=1) / rounding - 1, 0.0)  # σ² over q²/12
     return rounding * np.minimum(1.0, 6 / np.pi**2 * np.exp(-(np.pi**2) / 3 * quiet))
 
 
@@ -502,7 +502,7 @@ def observe_means(means: PoseMeans, gravity: float) -> Observations:
     accelerometer = means.recording.accelerometer
     count = len(accelerometer)
     columns = {
-        "start": np.arange(count, dtype=np.float64),
+        "start": np.arange(count, dtype=float),
         "stop": np.arange(1.0, count + 1),
         "temperature": np.full(count, REFERENCE_TEMPERATURE),
         "force": accelerometer.si(),
@@ -570,7 +570,7 @@ def _with_noise(
     padded, count = len(poses.mask), int(np.sum(poses.mask))
     start, stop = poses.start[:count], poses.stop[:count]
     at_rest = np.arange(count)
-    power_on = np.repeat(np.arange(len(parts)), [len(part.intervals) for part in parts])
+    power_on = np.arange(len(parts)).repeat([len(part.intervals) for part in parts])
     together = power_on[:, None] == power_on
 
     def among(rows: IntArray, covariance: FloatArray, size: int) -> FloatArray:
@@ -606,7 +606,7 @@ def _with_noise(
         edges = spans[used, :1] + np.diff(spans[used]) * np.arange(_PARTS + 1) / _PARTS
         first = np.concatenate([start, edges[:, :-1].ravel()])
         last = np.concatenate([stop, edges[:, 1:].ravel()])
-        owner = np.concatenate([power_on, np.repeat(power_on[used], _PARTS)])
+        owner = np.concatenate([power_on, power_on[used].repeat(_PARTS)])
         alike = owner[:, None] == owner
         white, slow = by_model("gyroscope", gyroscope, first, last, alike)
         # a later power-on has another bias: what its means at rest have in common tells nothing of the first one's

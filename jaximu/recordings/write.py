@@ -95,7 +95,7 @@ def _blocks(recording: Recording) -> Blocks:
 def _stamps(time: FloatArray, start: float) -> tuple[str, np.ndarray]:
     if abs(start) < _LONG_AGO:
         return "s", (start + time)[:, None]
-    return "ns", (round(Fraction(start) * 10**9) + np.round(time * 1e9).astype(np.int64))[:, None]
+    return "ns", (round(Fraction(start) * 10**9) + (time * 1e9).round().astype(np.int64))[:, None]
 
 
 def _columns(recording: Recording) -> dict[str, np.ndarray]:

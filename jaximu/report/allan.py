@@ -278,7 +278,7 @@ def _letter(
     inside = np.flatnonzero((line > bottom * 1.25) & (line < top / 1.25))
     if not len(inside):
         return
-    end = inside[np.argmax((total / line)[inside])]
+    end = inside[(total / line)[inside].argmax()]
     room = line[-1] < line[0] and end < 0.7 * len(tau)
     spot, align = end, "left" if room else "right"  # beside a line that leaves at the bottom
     if end < 12 or end > len(tau) - 12:  # on a line that leaves at the side

@@ -179,7 +179,7 @@ def _drift_figure(attribution: Attribution) -> Figure:
         text = "more in common than independent drift" if there else "no more in common than independent drift"
         axes.set_title(f"session {drift.session}: {text}, p {probability(drift.p_value)}", loc="left", fontsize=9)
         axes.set_ylabel(f"rate ({unit_text(unit)})", fontsize=8)
-    spread = factor * max(float(np.max(np.abs(drift.curve))) for drift in drifts)
+    spread = factor * max(float(np.abs(drift.curve).max()) for drift in drifts)
     grid[0].set_ylim(-2 * spread, 2 * spread)
     grid[-1].set_xlabel("time (s)")
     return figure

@@ -277,7 +277,7 @@ def check_words(budget: Budget, check: Trials) -> str:
     """Compare the budget with sessions put through the whole estimator."""
     known = np.flatnonzero(budget.determined)
     ratio = check.rms[known] / budget.total[known]
-    worst = int(np.argmax(np.abs(ratio - 1)))
+    worst = int(np.abs(ratio - 1).argmax())
     chance = Z95 / np.sqrt(2 * check.draws)
     failed = f" {check.failed} of them did not converge and are left out." if check.failed else ""
     return (

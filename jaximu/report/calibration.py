@@ -69,7 +69,7 @@ def _stations_figure(calibration: Calibration) -> Figure:
     """Draw each station's errors after calibration, by axis, with the standard deviation of its mean."""
     fit, stations = calibration.fit, calibration.stations
     assert fit is not None and stations is not None
-    panels = [panel for panel in station_errors(fit.imu, stations, fit.excess) if len(panel.station)]
+    panels = [panel for panel in station_errors(fit.imu, stations, np.asarray(fit.excess)) if len(panel.station)]
     figure, grid = figures.stacked(len(panels), 2.3, 0.0)
     for axes, panel in zip(grid, panels, strict=True):
         for shift, (axis, color), error, sigma in zip(

@@ -143,7 +143,7 @@ def _end(consequences: Consequences) -> str:
 def _places(consequences: Consequences) -> list[int]:
     """Rows of the times that are shown: 1, 10, 60, 600 s and the last, as far as the path goes."""
     wanted = [time for time in _SHOWN if time < consequences.times[-1]]
-    nearest = [int(np.argmin(np.abs(consequences.times - time))) for time in wanted]
+    nearest = [int(np.abs(consequences.times - time).argmin()) for time in wanted]
     return list(dict.fromkeys([*nearest, len(consequences.times) - 1]))
 
 
@@ -237,7 +237,7 @@ def _statements(consequences: Consequences) -> list[Statement]:
 def _budget_figure(consequences: Consequences) -> Figure:
     variances = {name: position(term) ** 2 for name, term in consequences.terms.items()}
     whole = np.maximum(np.sum(list(variances.values()), axis=0), 1e-300)
-    visible = [name for name in _order(consequences) if np.max(variances[name] / whole) >= LEAST_SHARE]
+    visible = [name for name in _order(consequences) if (variances[name] / whole).max() >= LEAST_SHARE]
     drawn, end = visible[: len(PALETTE)], f"after {_end(consequences)}"
     figure, (above, below) = figures.stacked(2, 3.2, sharex=True)
     for name, color in zip(drawn, PALETTE, strict=False):

@@ -206,7 +206,7 @@ def _number(diagnosis: Diagnosis) -> tuple[str, str]:
         )
     index = _shown_kind(diagnosis)
     shown = diagnosis.experiment.real.kinds[index]
-    measured = np.sqrt(np.mean(np.square(diagnosis.experiment.errors(diagnosis.base)[index])))
+    measured = np.sqrt(np.square(diagnosis.experiment.errors(diagnosis.base)[index]).mean())
     if diagnosis.verdict == "adequate":
         meaning = f"rms of {shown.words}: no more than noise, drift and handling leave"
     else:
@@ -379,7 +379,7 @@ def _cost(diagnosis: Diagnosis) -> Iterator[Statement]:
     ]
     if diagnosis.learned is not None and not diagnosis.learned.drift:
         learned = diagnosis.learned
-        peak = np.unravel_index(np.argmax(np.abs(learned.y)), learned.y.shape)
+        peak = np.unravel_index(np.abs(learned.y).argmax(), learned.y.shape)
         swing = with_interval(abs(learned.y[peak]), learned.half_width[peak] / Z95, SENSOR_UNITS[learned.triad])
         outputs.append(f"{learned.covariate} changes the {learned.triad}'s output by up to {swing} (95 %)")
     if outputs:
@@ -636,7 +636,7 @@ def _allan(experiment: Experiment, name: str) -> tuple[FloatArray, FloatArray, F
     # three axes, taken as independent and alike, know their mean √3 times as well as each its own
     known = (curve.value > 0).all(axis=0)  # output may not change at all
     low, high = (
-        value[known] * np.exp(np.mean(np.log(edge[:, known] / curve.value[:, known]), axis=0) / np.sqrt(3))
+        value[known] * np.exp(np.log(edge[:, known] / curve.value[:, known]).mean(axis=0) / np.sqrt(3))
         for edge in (curve.low, curve.high)
     )
     return curve.tau[known], value[known], low, high
@@ -649,5 +649,5 @@ def _density(experiment: Experiment, name: str) -> tuple[FloatArray, FloatArray]
     whole = np.stack(
         [segment[:length] - segment[:length].mean(axis=0) for segment in segments if len(segment) >= length]
     )
-    power = np.mean(np.abs(np.fft.rfft(whole, axis=1)) ** 2, axis=(0, 2)) / (length * rate)
-    return np.asarray(np.fft.rfftfreq(length, 1 / rate)[1:-1], np.float64), power[1:-1]
+    power = (np.abs(np.fft.rfft(whole, axis=1)) ** 2).mean(axis=(0, 2)) / (length * rate)
+    return np.asarray(np.fft.rfftfreq(length, 1 / rate)[1:-1], float), power[1:-1]

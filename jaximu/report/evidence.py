@@ -90,6 +90,6 @@ def evidence(calibration: Calibration) -> PoseAndTurnErrors | None:
 def largest_gap(directions: FloatArray) -> tuple[float, FloatArray]:
     """Return how far (deg) an orientation can lie from every pose, and the direction (3,) where that is so."""
     points = spiral(4000)  # one every 3°
-    angles = np.degrees(np.arccos(np.clip((points @ directions.T).max(axis=1), -1.0, 1.0)))
-    worst = int(np.argmax(angles))
+    angles = np.degrees(np.arccos((points @ directions.T).max(axis=1).clip(-1.0, 1.0)))
+    worst = int(angles.argmax())
     return angles[worst], points[worst]

@@ -248,7 +248,7 @@ def residuals_of(calibration: Calibration) -> Figure:
 
 
 def _rms(values: FloatArray) -> float:
-    return np.sqrt(np.mean(values**2))
+    return np.sqrt((values**2).mean())
 
 
 def residual_figure(errors: PoseAndTurnErrors) -> Figure:
@@ -263,7 +263,7 @@ def residual_figure(errors: PoseAndTurnErrors) -> Figure:
     dressed(grid[0], title, ylabel="before (m/s²)")
 
     factor, unit = readable("m/s^2", after)
-    edges = np.repeat(np.append(pose - 0.5, pose[-1] + 0.5), 2)[1:-1]
+    edges = np.append(pose - 0.5, pose[-1] + 0.5).repeat(2)[1:-1]
     for sigma, color, label in _explained(errors.norm_noise, errors.norm_sigma, "±2σ", " (“excess”)"):
         half = 2 * factor * np.repeat(sigma, 2)
         grid[1].fill_between(edges, -half, half, color=color, alpha=0.7, linewidth=0, label=label)
@@ -296,7 +296,7 @@ def residual_figure(errors: PoseAndTurnErrors) -> Figure:
 def _explained(noise: FloatArray, scatter: FloatArray, share: str, called: str = "") -> list[tuple]:
     """Return the bands of what scatter and noise explain, each with its colour and label; one where they are alike."""
     bands = [(noise, NOISE, f"{share}: what the measured noise explains")]
-    if np.any(scatter > 1.02 * noise):
+    if (scatter > 1.02 * noise).any():
         bands.insert(0, (scatter, SCATTER, f"{share}: noise and the scatter beyond it{called}"))
     return bands
 
@@ -317,7 +317,7 @@ def correlation_figure(calibration: Calibration) -> Figure:
     image = axes.imshow(matrix, cmap="RdBu_r", vmin=-1, vmax=1)
     axes.set_xticks(range(count), names, rotation=90, fontsize=8)
     axes.set_yticks(range(count), names, fontsize=8)
-    for row, column in zip(*np.nonzero(np.abs(matrix) >= 0.3), strict=True):
+    for row, column in zip(*(np.abs(matrix) >= 0.3).nonzero(), strict=True):
         if row != column:
             color = "white" if abs(matrix[row, column]) > 0.7 else "black"
             text = f"{matrix[row, column]:+.2f}".replace("-", "−").replace("0.", ".")
@@ -331,7 +331,7 @@ def correlation_figure(calibration: Calibration) -> Figure:
     scales = [index for index, name in enumerate(parameters) if name.owner == "accelerometer" and name.is_scale]
     others = matrix - np.eye(count)
     others[np.ix_(scales, scales)] = 0.0
-    first, second = sorted(np.unravel_index(int(np.argmax(np.abs(others))), others.shape))
+    first, second = sorted(np.unravel_index(int(np.abs(others).argmax()), others.shape))
     if first != second:
         value = matrix[first, second]
         what = (

@@ -108,7 +108,7 @@ def _earth(history: History) -> Statement | None:
             "orientation, such as gyroscope g-sensitivity, is in it. Run `jaximu diagnose`."
         )
         return Statement("Earth's rotation", text, True)
-    latitude = np.degrees(np.arcsin(np.clip(value[2] / total, -1, 1)))
+    latitude = np.degrees(np.arcsin((value[2] / total).clip(-1, 1)))
     return Statement(
         "Earth's rotation", f"Found as {rate} (15.04 °/h), which puts the unit at latitude {latitude:.2f}°."
     )
@@ -189,7 +189,7 @@ def _figure(calibration: Calibration, history: History) -> Figure:
         for line, sigma, color, name in lines:
             half = Z95 * sigma
             band(panel, time, line, half, color, label=name)
-            limit = max(limit, np.max(np.abs(line[middle:]) + half[middle:]))
+            limit = max(limit, (np.abs(line[middle:]) + half[middle:]).max())
         panel.set_ylim(-1.1 * limit, 1.1 * limit)  # the data sheet's uncertainty at the start would hide the rest
         legend(panel, 3, "upper right")
         dressed(panel, title)

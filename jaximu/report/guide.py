@@ -111,7 +111,7 @@ class LivePage:
 
     def _unit(self, name: str, attitude: FloatArray, alternative: str) -> str:
         picture = Picture(name, partial(_unit_figure, attitude), alternative)
-        return self._kept(name, np.round(attitude / _STEP).tobytes(), lambda: picture)
+        return self._kept(name, (attitude / _STEP).round().tobytes(), lambda: picture)
 
     def _map(self, moment: Moment, over: bool) -> str:
         """Return the map of what is uncertain, with the poses and, in another colour, the next one."""

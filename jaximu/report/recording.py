@@ -57,7 +57,7 @@ def signal_facts(signal: Signal, used: Signal | None = None) -> Json:
         "unit": signal.unit,
         "samples": len(signal),
         "rate": float(used.rate) if several else 0.0,
-        "jitter": float(np.std(interval)) if several else 0.0,
+        "jitter": float(interval.std()) if several else 0.0,
         "longest_gap": float(interval.max()) if several else 0.0,
         "duration": float(np.ptp(used.time)) if several else 0.0,
         "minimum": signal.values.min(axis=0).tolist() if len(signal) else [],

@@ -160,7 +160,7 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
 
 def _along(gain: FloatArray, sigma: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return the gain (3,) of each output along the axis that it is of, and whether that is another's for certain."""
-    axis = np.argmax(np.abs(gain), axis=1)
+    axis = np.abs(gain).argmax(axis=1)
     along = gain[range(3), axis]
     return along, (axis != range(3)) & (np.abs(along) > Z95 * sigma[range(3), axis])
 

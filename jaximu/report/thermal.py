@@ -180,7 +180,7 @@ def candidate_table(thermal: ThermalCalibration, name: str) -> Table:
         axes = [axis for axis, family in zip("xyz", fit.families, strict=True) if family == candidate.family]
         chosen = "" if not axes else "→ " if len(axes) == 3 else f"→ {', '.join(axes)}: "
         title = f"{candidate.family} (as the autopilots fit it)" if candidate.family == CUBIC else candidate.family
-        gap = np.sum(candidate.scores - best)
+        gap = (candidate.scores - best).sum()
         effects = "; ".join(effect_title(f"{PREFIXES[name]}.{one}").removeprefix(f"{name} ") for one in candidate.names)
         rows.append(
             (chosen + title, effects or "none", _size(name, candidate.held.rms), f"{gap:+.1f}".replace("-", "−"))
@@ -241,8 +241,8 @@ def _largest_change(calibration: Calibration, owner: str, plain: str) -> tuple[s
     temperature = np.linspace(low, high, 101)
     scale = calibration.triads()[owner].scales
     value, sigma = (values / scale for values in change(calibration, owner, (plain,), temperature))
-    rows = np.argmax(np.abs(value), axis=0), np.arange(3)
-    factor, unit = readable(SENSOR_UNITS[owner], np.max(np.abs(value)))
+    rows = np.abs(value).argmax(axis=0), np.arange(3)
+    factor, unit = readable(SENSOR_UNITS[owner], np.abs(value).max())
     cells = zip(factor * value[rows], factor * sigma[rows], strict=True)
     return (*(with_interval(largest, spread) for largest, spread in cells), unit)
 
@@ -387,8 +387,8 @@ def _within_data(thermal: ThermalCalibration, temperature: FloatArray, rates: Fl
     """Return at which rates and temperatures (r, m) there are blocks, or blocks on either side at that temperature."""
     blocks, margin = thermal.blocks, _BESIDE_DATA * np.ptp(rates)
     near = np.abs(temperature[:, None] - blocks.temperature) < _BESIDE_DATA * np.ptp(temperature)
-    low = np.min(np.where(near, blocks.rate, np.inf), axis=1) - margin
-    high = np.max(np.where(near, blocks.rate, -np.inf), axis=1) + margin
+    low = np.where(near, blocks.rate, np.inf).min(axis=1) - margin
+    high = np.where(near, blocks.rate, -np.inf).max(axis=1) + margin
     return (low <= rates[:, None]) & (rates[:, None] <= high)
 
 

@@ -148,7 +148,7 @@ def _change_figure(thermal: HandHeldThermal) -> Figure:
     for owner, word, names, force in _changed(thermal):
         scale = calibration.triads()[owner].scales
         value, sigma = (values / scale for values in change(calibration, owner, names, temperature, force=force))
-        factor, unit = readable(SENSOR_UNITS[owner], np.max(np.abs(value))) if word == "bias" else (100.0, "%")
+        factor, unit = readable(SENSOR_UNITS[owner], np.abs(value).max()) if word == "bias" else (100.0, "%")
         drawn.append((f"{sentence(owner)} {word} [{unit}]", factor * value, factor * sigma))
     rows = -(-len(drawn) // 2)
     figure = new_figure(2.9 * rows)

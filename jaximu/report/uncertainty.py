@@ -121,7 +121,7 @@ def _at_rest(calibration: Calibration, half: FloatArray) -> Iterator[str]:
     """Say where the corrected force is least certain, and what that means; `half`: over the sphere."""
     (inside, points), gravity = _map_points(), calibration.gravity
     directions, half = points[:, inside].reshape(-1, 3), half[:, inside].reshape(-1)
-    worst = int(np.argmax(half))
+    worst = int(half.argmax())
     where = f"the direction {direction_words(directions[worst])}"
     if not np.isfinite(half).all():
         sheet = [name for name in calibration.from_data_sheet if name.startswith("accelerometer")]
@@ -171,7 +171,7 @@ def _panels(calibration: Calibration, extent: Range) -> Iterator[tuple[str, str,
     warm = {name for name, triad in triads.items() if any("temperature" in effect.needs for effect in triad.effects)}
     low, high = calibration.data.get("temperature_range", extent.temperature)
     temperatures = np.linspace(low, high, _STEPS)
-    stimulus = steady(np.tile(_FACES, (len(temperatures), 1)), extent.gravity, np.repeat(temperatures, len(_FACES)))
+    stimulus = steady(np.tile(_FACES, (len(temperatures), 1)), extent.gravity, temperatures.repeat(len(_FACES)))
     uncertainty = calibration.uncertainty_of(stimulus) if warm & {"accelerometer", "gyroscope"} else {}
     for name, title, factor, unit in (
         ("accelerometer", "Specific force at rest, the worst of six faces up", 1e3, "mm/s²"),
@@ -263,7 +263,7 @@ def sphere_figure(
     levels = MaxNLocator(8, steps=[1, 2, 2.5, 5, 10]).tick_values(*span)
     colormap = LinearSegmentedColormap.from_list("", matplotlib.colormaps["YlGnBu"](np.linspace(0.0, 0.6, 64)))
     norm = BoundaryNorm(levels, colormap.N)
-    at = np.unravel_index(int(np.argmax(np.where(inside, half, -1.0))), half.shape)
+    at = np.unravel_index(int(np.where(inside, half, -1.0).argmax()), half.shape)
     for panel, axes in enumerate(panels):
         edge = Circle((0, 0), 1, transform=axes.transData)
         shades = axes.contourf(

@@ -71,7 +71,7 @@ def _statements(calibration: Calibration, vehicle: Mapping[str, Any]) -> Iterato
     change = vehicle["bias_change"]
     if change["value"] is not None:
         texts = with_intervals(change["value"], change["sigma"], "rad/s")
-        moved = np.max(np.abs(change["value"]) / np.array(change["sigma"])) > _SURE
+        moved = (np.abs(change["value"]) / np.array(change["sigma"])).max() > _SURE
         advice = " Use it for this drive, and let the unit warm up before the next." * bool(moved)
         yield Statement(
             "Bias over the drive",
@@ -94,7 +94,7 @@ def _mounting(vehicle: Mapping[str, Any]) -> str:
     known = "" if slope is None else f" The road at the stops sloped by {size(slope, 'rad', 2)} (rms), which is in it."
     roll, pitch = vehicle["roll"]["value"], vehicle["pitch"]["value"]
     up = np.array([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])  # in the unit
-    axis = int(np.argmax(np.abs(up)))
+    axis = int(np.abs(up).argmax())
     return (
         f"The unit's {'xyz'[axis]} axis points {'up' if up[axis] > 0 else 'down'}. "
         f"Roll {_interval(vehicle['roll'])} and pitch {_interval(vehicle['pitch'])} against the horizontal: the unit's "

@@ -162,7 +162,7 @@ def gravity_statements(calibration: Calibration) -> Iterator[Statement]:
         return
     share = 100 * Z95 * gravity.sigma / gravity.value
     sigmas = sigmas_of(calibration.covariance_of([Name("accelerometer", "gain", (k, k)) for k in range(3)]))
-    if np.all(100 * Z95 * sigmas < 0.9 * share * np.diag(triads["accelerometer"].gain)):  # what was felt is not gravity
+    if (100 * Z95 * sigmas < 0.9 * share * np.diag(triads["accelerometer"].gain)).all():  # what was felt is not gravity
         return
     text = (
         f"Gravity was taken as {gravity.value:.5f} ± {number(Z95 * gravity.sigma, 2)} m/s² (95 %). This alone leaves "

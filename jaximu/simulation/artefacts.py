@@ -119,7 +119,7 @@ class Clipping(Artefact):
             limit = getattr(self, sensor)
             if limit is not None and sensor in samples.values:
                 values = samples.values[sensor]
-                counts[sensor] += int(np.sum(np.any(np.abs(values) > limit, axis=1)))
+                counts[sensor] += int(np.sum((np.abs(values) > limit).any(axis=1)))
                 np.clip(values, -limit, limit, out=values)
         return counts
 

@@ -170,7 +170,7 @@ class Specification:
             if gain.shape != (3, 3) or abs(np.linalg.det(gain)) < 1e-12:
                 raise InputError(f"{name}.gain must be an invertible 3×3 matrix.")
         else:
-            rows, columns = np.tril_indices(3, -1) if name == "accelerometer" else np.nonzero(1 - np.eye(3))
+            rows, columns = np.tril_indices(3, -1) if name == "accelerometer" else (1 - np.eye(3)).nonzero()
             gain = np.diag(1 + draw.several(table.get("scale", 0.0), 3, f"{name}.scale"))
             gain[rows, columns] = draw.several(table.get("misalignment", 0.0), len(rows), f"{name}.misalignment")
             gain = counts * gain

@@ -226,7 +226,7 @@ class Effect(eqx.Module):
     def typical_sizes(self, scale: float | Array) -> Effect:
         """Return plausible deviations of every number of this effect, for a triad of so many output units per SI."""
         size = self.typical * (scale if self.unit.startswith("output") else 1.0)
-        return type(self)(np.ones(self.size) * size, **jax.tree.map(np.float64, self._typical_inner()))
+        return type(self)(np.ones(self.size) * size, **jax.tree.map(float, self._typical_inner()))
 
     def needed(self, stimulus: Stimulus) -> list[Array]:
         """Return the fields of a stimulus that the effect needs, in their order. Raises `InputError` as `need` does."""

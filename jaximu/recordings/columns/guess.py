@@ -151,7 +151,7 @@ class _Triad:
         self.noise = float(np.sqrt(np.median(np.sort(scatter)[: max(1, len(scatter) // 4)]) / 3))
         # its quiet windows are rest, seen from the size of what it holds
         self.still = self.noise < 0.03 * self.level
-        self.steady = bool(self.level > 0 and np.std(norm) < _STEADY * self.level)
+        self.steady = bool(self.level > 0 and norm.std() < _STEADY * self.level)
         directions = means / np.maximum(norm[:, None], 1e-300)
         self.posed = bool(len(means) > 3 and np.linalg.norm(directions.mean(axis=0)) < 0.9)
         # the norm changes where it moves, as a magnetometer's does not
@@ -234,7 +234,7 @@ class _Guess:
 
     def _numbers(self, at: int) -> FloatArray | None:
         try:
-            values = np.asarray(self.table.numbers(at), np.float64)
+            values = np.asarray(self.table.numbers(at), float)
         except InputError:
             return None
         return values if np.isfinite(values).sum() > 1 else None
@@ -308,7 +308,7 @@ class _Guess:
                 continue  # a name that says something else: a counter, a tick, an angle
             steps = np.diff(values)
             usual = np.median(steps)
-            if np.mean(steps == 1.0) > 0.9 or not np.mean(np.abs(steps - usual) < 0.5 * abs(usual)) > 0.8:
+            if (steps == 1.0).mean() > 0.9 or not (np.abs(steps - usual) < 0.5 * abs(usual)).mean() > 0.8:
                 continue  # a counter, or a sum of something
             self.reasons.append(f"column {self.table.label(at)} rises steadily, by {usual:.4g} a row: time")
             return at
@@ -414,7 +414,7 @@ class _Guess:
                 continue
             finite = values[np.isfinite(values)]
             steps = np.diff(finite)
-            counter = rises(values) and (np.mean(steps == 1.0) > 0.9 or np.mean(steps > 0) > 0.98)
+            counter = rises(values) and ((steps == 1.0).mean() > 0.9 or (steps > 0).mean() > 0.98)
             if np.ptp(finite) > 0 and not counter:
                 free.append(at)
         quaternion: set[int] = set()
@@ -561,7 +561,7 @@ class _Guess:
         """How far the time column rises a row."""
         values = np.asarray(self.numbers[self.time or 0])
         steps = np.diff(values[np.isfinite(values)])
-        return np.sum(steps) / max(int(np.sum(steps > 0)), 1)
+        return steps.sum() / max(int((steps > 0).sum()), 1)
 
     def _time_units(self) -> list[tuple[str, float]]:
         """The units in which the stamps mean a plausible rate, or the stated one; by name and factor."""
@@ -681,7 +681,7 @@ class _Guess:
             self.chosen[time] = Column(TIME, self.fields[time].unit)
             return slope
         label, options, step = self.table.label(time), self._time_units(), self._step()
-        if len(options) == 1 and np.all(np.diff(np.asarray(self.numbers[time])) == 1.0) and not self.table.rate:
+        if len(options) == 1 and (np.diff(np.asarray(self.numbers[time])) == 1.0).all() and not self.table.rate:
             options = []  # rows counted from the first on
         if len(options) > 1 and slope is not None and gyro is not None:
             stated = find_unit(gyro.unit or "", "angular rate")
@@ -813,7 +813,7 @@ class _Guess:
     def _temperature_unit(self, label: str, values: FloatArray) -> str | None:
         """°C, or a chip's counts: whole numbers beside sensors in counts, or what no sensor survives."""
         low, high = values.min(), values.max()
-        counts = any(column.unit == "count" for column in self.chosen.values()) and np.all(values == np.round(values))
+        counts = any(column.unit == "count" for column in self.chosen.values()) and (values == values.round()).all()
         if -60 < low <= high < _HOTTEST and not counts:
             self.reasons.append(f"{label} states no unit and is taken to be in °C")
             return "degC"

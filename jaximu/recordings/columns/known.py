@@ -234,4 +234,4 @@ def _seconds(values: np.ndarray) -> np.ndarray | None:
 def _in_step(seconds: np.ndarray, rest: np.ndarray) -> bool:
     """Whether seconds rise where what is left of them falls, and hardly anywhere else."""
     falls, rises = np.diff(rest) < 0, np.diff(seconds) > 0
-    return bool(falls.any() and rises[falls].all() and np.sum(rises & ~falls) <= _GAPS * falls.sum())
+    return bool(falls.any() and rises[falls].all() and (rises & ~falls).sum() <= _GAPS * falls.sum())

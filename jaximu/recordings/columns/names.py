@@ -121,6 +121,6 @@ def rises(values: np.ndarray) -> bool:
     if values.dtype == object or len(values) < 3:
         return False
     steps = np.diff(values[np.isfinite(values)])
-    back = np.sum(steps < 0)
+    back = (steps < 0).sum()
     ended = steps.sum() > 0 or bool(back and steps[steps < 0].max() < -np.ptp(values[np.isfinite(values)]) / 2)
-    return bool(len(steps) > 0 and np.mean(steps > 0) > 0.2 and back < 0.02 * len(steps) and ended)
+    return bool(len(steps) > 0 and (steps > 0).mean() > 0.2 and back < 0.02 * len(steps) and ended)

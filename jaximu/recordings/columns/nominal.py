@@ -32,7 +32,7 @@ def parse_scale(stated: Stated, quantity: str, option: str) -> FloatArray:
         scale = 1.0 / (numbers * unit(match[1], quantity, column=option).factor)
     else:
         raise InputError(f"{option}: {rest!r} is no unit of a scale; write count/UNIT or UNIT/count, such as count/g.")
-    return np.asarray(scale, np.float64)
+    return np.asarray(scale, float)
 
 
 def parse_offset(stated: Stated, option: str) -> FloatArray:
@@ -142,13 +142,13 @@ def fit_sphere(points: FloatArray) -> tuple[FloatArray, float] | None:
     orientations do not determine the sphere, or the points lie on none.
     """
     spread = float(np.linalg.norm(np.ptp(points, axis=0))) or 1.0
-    _, cell = np.unique(np.round(points / (0.03 * spread)), axis=0, return_inverse=True)
+    _, cell = np.unique((points / (0.03 * spread)).round(), axis=0, return_inverse=True)
     cell = cell.ravel()
     root = np.sqrt(1.0 / np.bincount(cell)[cell])[:, None]
     middle = np.average(points, axis=0, weights=root[:, 0] ** 2)
     scaled = (points - middle) / spread
     design = np.column_stack([2.0 * scaled, np.ones(len(scaled))]) * root
-    target = np.sum(scaled**2, 1) * root[:, 0]
+    target = (scaled**2).sum(1) * root[:, 0]
     fitted, miss = np.ones(len(points), bool), np.zeros(len(points))
     solution, radius = np.zeros(4), 1.0
     for _ in range(5):
@@ -157,9 +157,9 @@ def fit_sphere(points: FloatArray) -> tuple[FloatArray, float] | None:
         radius = np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 1e-12))
         miss = np.abs(lengths_of(scaled - solution[:3]) - radius)
     weight = root[fitted] ** 2
-    around = scaled[fitted] - np.sum(weight * scaled[fitted], 0) / weight.sum()
+    around = scaled[fitted] - (weight * scaled[fitted]).sum(0) / weight.sum()
     thinnest = np.linalg.svd(around * root[fitted], compute_uv=False)[-1] / np.sqrt(weight.sum())
-    off_sphere = np.sqrt(np.mean(miss[fitted] ** 2)) > 0.05 * radius
+    off_sphere = np.sqrt((miss[fitted] ** 2).mean()) > 0.05 * radius
     if len(np.unique(cell[fitted])) < 5 or thinnest < 0.1 * radius or off_sphere:
         return None
     return solution[:3] * spread + middle, radius * spread

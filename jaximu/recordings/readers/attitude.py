@@ -168,8 +168,8 @@ def _time(table: LogTable, places: _Places, name: str, notes: list[str]) -> tupl
     else:
         factor = unit(stated, ("time",), file=table.path, column="time").factor
     first = stamps[0]
-    return np.asarray((stamps - first) * factor, np.float64), float(first) * factor
+    return np.asarray((stamps - first) * factor, float), float(first) * factor
 
 
 def _quaternion(rotation: scipy.spatial.transform.Rotation) -> FloatArray:
-    return np.asarray(rotation.as_quat(scalar_first=True), np.float64)
+    return np.asarray(rotation.as_quat(scalar_first=True), float)

@@ -32,7 +32,7 @@ def seconds_of(column: np.ndarray) -> np.ndarray | None:
         hours = int(match[1]) % 12 + 12 * (match[5].lower() == "pm") if match[5] else int(match[1])
         seconds = 3600 * hours + 60 * int(match[2]) + int(match[3])
         stamps[at] = seconds * 10**9 + int((match[4] or "").ljust(9, "0"))
-    return stamps + np.cumsum(np.diff(stamps, prepend=stamps[:1]) < -turn // 2) * turn
+    return stamps + (np.diff(stamps, prepend=stamps[:1]) < -turn // 2).cumsum() * turn
 
 
 def measured(column: np.ndarray, decimal: str = ".") -> tuple[FloatArray, str] | None:

@@ -84,7 +84,7 @@ def read(path: Path, source: Source) -> LogTable:
             columns[at] = np.array([cell[:-1] for cell in column], object)
         elif (stamps := seconds_of(column)) is not None:
             columns[at], unit = stamps, "ns"
-            midnight = int(np.argmax(np.diff(stamps // DAY, prepend=stamps[:1] // DAY) > 0))
+            midnight = int((np.diff(stamps // DAY, prepend=stamps[:1] // DAY) > 0).argmax())
         elif with_unit := measured(column, layout.decimal):
             columns[at], unit = with_unit
         if unit:
@@ -109,9 +109,7 @@ def _vectors_apart(names: Sequence[str], columns: Sequence[np.ndarray]) -> tuple
             continue
         title, unit = parse_column(name)
         titles += [column_title(f"{title}.{axis}", unit) for axis in "xyz"]
-        parts += [
-            *np.array([[number for number in match.groups() if number] for match in matches if match], np.float64).T
-        ]
+        parts += [*np.array([[number for number in match.groups() if number] for match in matches if match], float).T]
     return titles, parts
 
 

@@ -128,5 +128,5 @@ def _rows(log: Any) -> dict[tuple[str, int], np.ndarray]:
 def _table(source: Source, time: np.ndarray, values: dict[str, np.ndarray]) -> LogTable:
     if not (np.abs(time) < _LATEST).all():
         raise ValueError("a time stamp is no number of microseconds")
-    columns = (time.astype(np.int64), *(np.ascontiguousarray(column, np.float64) for column in values.values()))
+    columns = (time.astype(np.int64), *(np.ascontiguousarray(column, float) for column in values.values()))
     return LogTable(source, ("time [us]", *values), columns, messages=True)

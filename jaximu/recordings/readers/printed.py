@@ -187,7 +187,7 @@ def _numbers(texts: Sequence[str]) -> np.ndarray:
             return np.array(texts, np.int64)
         except (ValueError, OverflowError):
             pass
-    return np.array(texts, np.float64)
+    return np.array(texts, float)
 
 
 def read(data: bytes, source: Source) -> LogTable:

@@ -321,7 +321,7 @@ def _sigma_of_means(table: LogTable, sensor: str, base: str) -> FloatArray | Non
         raise InputError(f"{table.path}: column {missing[0]} is missing beside {there[0]}.")
 
     def positive(name: str, factor: float = 1.0) -> FloatArray:
-        values = np.asarray(table.numbers(named[name][0]), np.float64) * factor
+        values = np.asarray(table.numbers(named[name][0]), float) * factor
         if (wrong := ~(values > 0)).any():
             raise InputError(f"{table.where(np.argmax(wrong))}: column {name!r} must be greater than zero.")
         return values
@@ -612,7 +612,7 @@ def _stamped(table: LogTable, clock: int, unit: Unit) -> LogTable:
     missing = np.isnan(table.numbers(clock))
     if not 0 < missing.mean() <= FEW:
         return table
-    note = f"{counted(int(missing.sum()), 'row')} without a time left out (row {table.row(np.argmax(missing))})."
+    note = f"{counted(int(missing.sum()), 'row')} without a time left out (row {table.row(missing.argmax())})."
     return table.take(np.flatnonzero(~missing)).noted(note)
 
 
@@ -632,13 +632,13 @@ def _carried_on(table: LogTable, clock: int, unit: Unit) -> LogTable:
         full = stamps.dtype.type(round(span) if stamps.dtype.kind == "i" else span)
         back = np.flatnonzero(steps < -full / 2)
         after = (steps[back] + full) / usual
-        if not len(back) or not np.all((after > nearest) & (after < farthest)):
+        if not len(back) or not ((after > nearest) & (after < farthest)).all():
             continue
         turns = np.zeros(len(stamps), stamps.dtype)
         turns[back + 1] = full
         places = f"{counted(len(back), 'place')} (row {table.row(back[0] + 1)})"
         note = f"the clock starts again after {seconds:.10g} s in {places}: its time goes on from there."
-        return table.with_column(clock, stamps + np.cumsum(turns)).noted(note)
+        return table.with_column(clock, stamps + turns.cumsum()).noted(note)
     return table
 
 
@@ -653,7 +653,7 @@ def _ordered(table: LogTable, clock: int, unit: Unit) -> LogTable:
         return table
     back = (np.maximum.accumulate(stamps) - stamps).max() * unit.factor
     if back > _SET_BACK:
-        first = np.argmax(steps < 0) + 1
+        first = (steps < 0).argmax() + 1
         raise InputError(
             f"{table.path}, message {table.row(first)}: the clock goes back, by up to {back:.6g} s; cut the log there, "
             "or use the receive stamps (--stamp receive)."
@@ -738,7 +738,7 @@ def _rising(table: LogTable, clock: int, unit: Unit) -> LogTable:
     # of two runs that are sorted into each other every other step is at most half of the usual one
     close, before = (int(np.sum((gaps >= 0) & (gaps < _HALVED * usual))) for gaps in (kept_steps, steps))
     if len(back) and close > max(20, 0.02 * count) + before:
-        row = back[np.argmin(steps[back - 1])]
+        row = back[steps[back - 1].argmin()]
         raise InputError(
             f"{table.where(row)}: the clock goes back by {-steps[row - 1] * unit.factor:.6g} s, and the rows "
             "from there on are not those of the same times before: two recordings in one file (data.order). Cut it "
@@ -759,7 +759,7 @@ def _rising(table: LogTable, clock: int, unit: Unit) -> LogTable:
     if shared.mean() > 0.25:  # bursts with one time of arrival for all their rows
         number = np.arange(len(kept))
         position = number - np.maximum.accumulate(np.where(np.concatenate([[True], ~shared]), number, 0))
-        table = table.with_column(clock, stamps.astype(np.float64) + 1e-4 * usual * position)
+        table = table.with_column(clock, stamps.astype(float) + 1e-4 * usual * position)
     return table
 
 
@@ -768,16 +768,16 @@ def _even_clock(stamps: np.ndarray) -> np.ndarray | None:
 
     Rows out of order have stamps that are even once sorted.
     """
-    number = np.arange(len(stamps), dtype=np.float64)
-    since = (stamps - stamps[0]).astype(np.float64)
+    number = np.arange(len(stamps), dtype=float)
+    since = (stamps - stamps[0]).astype(float)
     period, start = np.polyfit(number, since, 1) if len(stamps) > 32 else (0.0, 0.0)
     whole = stamps.dtype.kind != "f"
-    if period <= (2.0 if whole else 0.0) or np.max(np.abs(since - start - period * number)) > _JITTER * period:
+    if period <= (2.0 if whole else 0.0) or np.abs(since - start - period * number).max() > _JITTER * period:
         return None
     if np.diff(np.sort(since)).std() < _UNEVEN * period:
         return None
     even = start + period * number
-    return stamps[0] + (np.round(even).astype(stamps.dtype) if whole else even)
+    return stamps[0] + (even.round().astype(stamps.dtype) if whole else even)
 
 
 def _stamps(table: LogTable, used: Used, options: ReadOptions) -> tuple[FloatArray, Fraction | float, list[str]]:
@@ -830,7 +830,7 @@ def _signal(table: LogTable, columns: Sequence[tuple[np.ndarray, int, Unit]], st
         raise InputError(f"{table.where(kept[np.argmax(missing)])}: the time stamp is empty or NaN.")
     steps = np.diff(stamps)
     if (steps <= 0.0).any():
-        at = np.argmax(steps <= 0.0) + 1
+        at = (steps <= 0.0).argmax() + 1
         what = "repeats that of the row before" if steps[at - 1] == 0.0 else f"goes back by {-steps[at - 1]:.6g} s"
         raise InputError(
             f"{table.where(kept[at])}: the time stamp {what}; delete such rows, or if the stamps are "

@@ -91,7 +91,7 @@ def _table(columns: Mapping[str, Any], source: Source) -> LogTable:
             continue
         try:
             array = np.array([np.nan if value is None else value for value in values], dtype=object)
-            numbers = array.astype(np.float64)
+            numbers = array.astype(float)
             whole = all(isinstance(value, int) or (isinstance(value, str) and value.isdigit()) for value in array)
             arrays[name] = array.astype(np.int64) if whole else numbers
         except (TypeError, ValueError, OverflowError):
@@ -99,7 +99,7 @@ def _table(columns: Mapping[str, Any], source: Source) -> LogTable:
                 if (stamps := seconds_of(np.array(values, dtype=object))) is not None:
                     arrays[f"{name} [ns]"] = stamps
             elif all(isinstance(value, list) for value in values) and len(set(map(np.shape, values))) == 1:
-                arrays[name] = np.array(values, dtype=np.float64)
+                arrays[name] = np.array(values, dtype=float)
     return table_of(arrays, source)
 
 
@@ -185,7 +185,7 @@ def of_device(table: LogTable, device: str | None, usual: str | None = None) -> 
             continue
         names = np.array(list(map(str, table.columns[at].tolist())))
         units, counts = np.unique(names, return_counts=True)
-        in_turn = np.mean(names[1:] != names[:-1])
+        in_turn = (names[1:] != names[:-1]).mean()
         if not 1 < len(units) <= _MOST_DEVICES or counts.min() < _FEWEST * len(names) or in_turn < _IN_TURN:
             continue
         if not _alike(table, [names == unit for unit in units]):  # rows of several sensors of one unit
@@ -247,7 +247,7 @@ def _units_in_turn(table: LogTable) -> int:
         if table.names and field.sensor not in SENSORS:
             continue
         try:
-            values = np.asarray(table.numbers(at)[:_ROWS], np.float64)
+            values = np.asarray(table.numbers(at)[:_ROWS], float)
         except InputError:
             continue
         if np.isfinite(values).all() and not rises(values):

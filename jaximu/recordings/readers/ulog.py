@@ -64,9 +64,9 @@ def _fifo(data: _Fields, stamp: str) -> _Samples:
     count, step, scale = (data[name][:, None] for name in ("samples", "dt", "scale"))
     valid = index < count
     time = data["timestamp_sample" if stamp == "header" else "timestamp"].astype(np.int64)
-    before = (count.astype(np.int64) - 1 - index) * step.astype(np.float64)
+    before = (count.astype(np.int64) - 1 - index) * step.astype(float)
     samples = (np.stack([data[f"{axis}[{at}]"] for at in index], 1) for axis in "xyz")
-    values = [(output * scale.astype(np.float64))[valid] for output in samples]
+    values = [(output * scale.astype(float))[valid] for output in samples]
     return (time[:, None] * 1000 - np.rint(1e3 * before).astype(np.int64))[valid], values
 
 
@@ -183,5 +183,5 @@ def _table(source: Source, time: np.ndarray, values: Mapping[str, np.ndarray], u
     if time.dtype.kind not in "iu":
         raise ValueError("a time stamp is no number of microseconds")
     with np.errstate(invalid="ignore"):  # of a NaN that signals
-        columns = (time.astype(np.int64), *(column.astype(np.float64, copy=False) for column in values.values()))
+        columns = (time.astype(np.int64), *(column.astype(float, copy=False) for column in values.values()))
     return LogTable(source, (f"time [{unit}]", *values), columns, messages=True)

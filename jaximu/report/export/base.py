@@ -33,7 +33,7 @@ class LinearTriad:
     @property
     def inverse(self) -> FloatArray:
         """(3, 3) SI units per unit of y."""
-        return np.asarray(np.linalg.inv(self.gain), np.float64)
+        return np.asarray(np.linalg.inv(self.gain), float)
 
 
 @dataclass(frozen=True)
@@ -156,11 +156,11 @@ class ExportedUnit:
 
     def _in(self, maps: Mapping[str, FloatArray], frames: Mapping[str, FloatArray], axes: str) -> ExportedUnit:
         """Make them for outputs and answers in these axes: y = Aᵀ y_body and u = Fᵀ u_body, so the gain is AᵀKF."""
-        sensitivity = np.asarray(self.calibration.imu.coefficients(GyroGSensitivity), np.float64).reshape(3, 3)
+        sensitivity = np.asarray(self.calibration.imu.coefficients(GyroGSensitivity), float).reshape(3, 3)
         triads = {
             name: LinearTriad(
-                maps[name].T @ np.asarray(triad.gain, np.float64) @ frames[name],
-                maps[name].T @ np.asarray(triad.bias, np.float64),
+                maps[name].T @ np.asarray(triad.gain, float) @ frames[name],
+                maps[name].T @ np.asarray(triad.bias, float),
                 triad.output_unit,
                 (name == GyroGSensitivity.owner) * maps[name].T @ sensitivity @ frames["accelerometer"],
             )
@@ -195,7 +195,7 @@ class ExportedUnit:
         view = Kalibr.from_gains(
             self.accelerometer.gain, self.accelerometer.bias, gyroscope.gain, gyroscope.bias, gyroscope.g_sensitivity
         )
-        made = {name: np.asarray(value, np.float64) for name, value in vars(view).items()}
+        made = {name: np.asarray(value, float) for name, value in vars(view).items()}
         # the zeros above a triangle, where a factorisation leaves 1e-19
         made["accel_matrix"], made["gyro_matrix"] = np.tril(made["accel_matrix"]), np.tril(made["gyro_matrix"])
         return made

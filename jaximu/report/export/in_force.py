@@ -119,7 +119,7 @@ class Composition:
         for name in self.unit.triads:
             (offset, scale), (new_offset, new_scale) = (self._correction(name, of) for of in (self.file, self._new))
             change = gravity * (new_scale / scale - 1.0) * up + new_scale * (offset - new_offset)
-            level = change - np.sum(change * up, axis=1, keepdims=True) * up
+            level = change - (change * up).sum(axis=1, keepdims=True) * up
             most, tilted = (float(lengths_of(part).max()) for part in (change, level))
             amounts |= _at_rest(name, most, tilted / gravity)
         return amounts
@@ -196,7 +196,7 @@ class Composition:
     def _sigmas(self) -> dict[str, float]:
         """One sigma of each parameter: by central differences over the calibration's gains and biases."""
         calibration, write, small = self.unit.calibration, writer(self.to).write, 1e-6
-        numbers, names = np.asarray(flatten(calibration.imu), np.float64), names_of(calibration.imu)
+        numbers, names = np.asarray(flatten(calibration.imu), float), names_of(calibration.imu)
         free = [name for name in calibration.names if name.effect is None and name.owner in self.unit.triads]
 
         def values(row: int, step: float) -> FloatArray:

@@ -39,7 +39,7 @@ def write(parameters: ExportedUnit) -> Written:
         f"    bias: {accel_bias}",
     ]
     corrections = {
-        "accelerometer": Correction(np.asarray(np.linalg.inv(accel), np.float64), view["accel_bias"], frame=frame)
+        "accelerometer": Correction(np.asarray(np.linalg.inv(accel), float), view["accel_bias"], frame=frame)
     }
     equation = f"f = inverse(M) (y - b)\nM = {matrix_text(accel)}\nb = {accel_bias}"
     if "gyroscope" in parameters.triads:

@@ -161,7 +161,7 @@ class _Targets:
             values, model = np.concatenate([data, values]), np.concatenate([fit.fitted, model])
             counted = slice(len(blocks))
             weight = np.concatenate([np.ones(len(blocks)), weight * _STEADY * len(blocks) / _POINTS])
-        size = np.max(np.abs(celsius - about))
+        size = np.abs(celsius - about).max()
         fitted = np.polynomial.polynomial.polyfit((celsius - about) / size, values, 3, w=np.sqrt(weight))
         cubic = np.float32(fitted / size ** np.arange(4)[:, None] / unit).astype(float)
         written = np.vander((celsius - about)[counted], 4, increasing=True) @ (cubic * unit)

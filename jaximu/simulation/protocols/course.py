@@ -190,7 +190,7 @@ class Course:
             acceleration=np.reshape([tone.acceleration for tone in tones], (-1, 3)),
             rocking=np.reshape([tone.rocking for tone in tones], (-1, 3)),
             phase=rng.uniform(0, 2 * np.pi, (len(tones), 2)),
-            window=np.clip(np.reshape([(tone.start, tone.stop) for tone in tones], (-1, 2)), -1e9, 1e9),
+            window=np.reshape([(tone.start, tone.stop) for tone in tones], (-1, 2)).clip(-1e9, 1e9),
             gravity=np.asarray(environment.gravity, float),
             earth=np.zeros(3) if environment.latitude is None else earth_rate(np.radians(environment.latitude)),
             field=field_of(environment.field, environment.dip),
