@@ -217,7 +217,7 @@ def _rotation(shared: _Shared, corrected: Recording, delay: float) -> FloatArray
     known_force, known_rate = shared.means(shared.first, 0.0)
     weight = np.sum(rate**2) / np.sum(force**2)
     back = turning_best(known_rate.T @ rate + weight * known_force.T @ force)
-    left = np.sum((known_rate - rate @ back.T) ** 2) / np.sum(known_rate**2)
+    left = ((known_rate - rate @ back.T) ** 2).sum() / (known_rate**2).sum()
     if left > 1 - _ALIKE:
         raise NotPossibleError(
             f"{corrected.name} does not turn as {shared.first.name} does: however the one is mounted on the other, "

@@ -465,7 +465,7 @@ def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
         turning, rotating, force, up = common
         weight = np.sum(turning**2) / np.sum(force**2)
         matrix = turning_best(turning.T @ rotating + weight * STANDARD.value * (force.T @ up))
-        explained = 1 - np.sum((turning - rotating @ matrix.T) ** 2) / np.sum(turning**2)
+        explained = 1 - ((turning - rotating @ matrix.T) ** 2).sum() / (turning**2).sum()
         upright = dot_rows(force, up @ matrix.T).mean() / lengths_of(force).mean()
         if best is None or explained > best.explained:
             best = _Start(attitude, float(delay + shift), matrix, float(explained), float(upright))

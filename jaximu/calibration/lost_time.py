@@ -217,7 +217,7 @@ class _Recorded:
             (self.projector @ self.residual)[rows.ravel()],
             real,
             turned[rows[:, :, None], rows[:, None, :]],
-            np.sum(missed**2, axis=1)[:, None, None] / 3 * np.eye(2),
+            (missed**2).sum(axis=1)[:, None, None] / 3 * np.eye(2),
             np.einsum("tsa,tsb->tab", self.lacking, self.lacking),
         )
         self.excess = float(excess[1])

@@ -306,7 +306,7 @@ def _mounted(
         "roll": _entry(angles[0], sigmas[0], "rad"),
         "pitch": _entry(angles[1], sigmas[1], "rad"),
         "yaw": _entry(angles[2], sigmas[2], "rad") if determined else None,
-        "slope": None if len(different) < 2 else float(np.sqrt(np.sum(different.var(axis=0, ddof=1)))),
+        "slope": None if len(different) < 2 else float(np.sqrt(different.var(axis=0, ddof=1).sum())),
         "speeds": [
             {"stop": int(side), "along": float(along), "left": float(left)}
             for side, (along, left) in zip(sides, speeds @ across @ axes[:2].T, strict=True)

@@ -410,7 +410,7 @@ class _Groups:
         days, lots = days_of([row["date"] for row in units.rows]), np.array(_names(units))
         known = np.isfinite(days)
         dated = bool(known.sum() >= FEWEST and np.ptp(days[known]) >= 1)
-        middle = float(np.mean(days[known])) if dated else 0.0
+        middle = float(days[known].mean()) if dated else 0.0
         names, counts = np.unique(lots[lots != ""], return_counts=True)
         names = tuple(names[counts >= 3].tolist())
         names = names if len(names) > 1 else ()

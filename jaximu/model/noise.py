@@ -224,7 +224,7 @@ class NoiseStream:
         padded = -(-samples // BLOCK) * BLOCK
         total = np.zeros((*self.shape, 3, padded))
         for through, generators in self._still:
-            total += np.sum(through[..., None] * self._draw(generators, through.shape[-1], padded), axis=-2)
+            total += (through[..., None] * self._draw(generators, through.shape[-1], padded)).sum(axis=-2)
         if self._blocks is not None:
             draws = [self._draw(generators, system.drive.shape[-1], padded) for system, generators in self._moving]
             output, self._state = run(self._blocks, self._state, np.concatenate(draws, axis=-2))

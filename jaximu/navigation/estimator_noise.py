@@ -205,7 +205,7 @@ class MeasuredErrors:
             steady = steady_stamps(stamp, velocity, whole.apply(felt) - [0.0, 0.0, fitted.gravity.value])
         if not steady.all():
             notes.append(
-                f"{attitude.name} leaps: at {int(np.sum(~steady))} of {len(stamp)} stamps its velocity changes as the "
+                f"{attitude.name} leaps: at {int((~steady).sum())} of {len(stamp)} stamps its velocity changes as the "
                 "unit cannot have moved. Stretches that begin or end there are left out."
             )
         if known.period > 2 * float(np.median(np.diff(middle))):

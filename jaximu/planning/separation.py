@@ -199,7 +199,7 @@ def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict
     ]
 
     def ruled_out(rival: int, there: int) -> float:
-        rest = min(float(np.sum(off(span, signals[there]) ** 2)) for span in spans[rival])
+        rest = min(float((off(span, signals[there]) ** 2).sum()) for span in spans[rival])
         return _detected(rest, effects[there].size, _LEVEL)
 
     return {effects[k].name: min(ruled_out(k, 0), ruled_out(0, k)) for k in range(1, len(effects))}

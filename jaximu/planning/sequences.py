@@ -384,7 +384,7 @@ def _poses_and_turns(words: Sequence[str], equipment: Equipment) -> tuple[tuple[
 
     def stand(attitude: Rotation) -> Pose:
         quaternion = attitude.as_quat(scalar_first=True)
-        return Pose(up_of(quaternion), quaternion, pose_words(np.round(up_of(quaternion))))
+        return Pose(up_of(quaternion), quaternion, pose_words(up_of(quaternion).round()))
 
     poses = [stand(attitude)]
     for word in words:

@@ -176,7 +176,7 @@ def turning(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, ra
     kept = values > 1e-6 * values[-1]
     inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
     matrix = inverse @ (columns.T @ changes)
-    left = np.sum((changes - columns @ matrix) ** 2)
+    left = ((changes - columns @ matrix) ** 2).sum()
     variance = np.where(kept.all(), np.diag(inverse), np.inf) * left / max(len(changes) - 9, 1)
     return Turning(
         matrix.reshape(3, 3),
@@ -403,7 +403,7 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
         return power - np.einsum("...i,...ij,...j->...", product, inverse, product)
 
     line = np.zeros(2)  # of the lag: at the middle, and by time
-    power = np.add.reduceat(np.sum(changes**2, axis=1), edges[:-1])
+    power = np.add.reduceat((changes**2).sum(axis=1), edges[:-1])
     whole = power.sum()
     enough = (1 - _WELL) * whole
     normal, product = sums(0.0)
@@ -442,7 +442,7 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     freedom = int(good.sum()) - 2
     spread = (weight * missed**2).sum() / freedom
     # parts that agree by chance are no surer than the noise of their samples lets them be
-    spread = max(spread * float(student_isf(0.025, freedom) / 1.96) ** 2, np.mean(rest**2))
+    spread = max(spread * float(student_isf(0.025, freedom) / 1.96) ** 2, (rest**2).mean())
     sigma, drift_sigma = np.sqrt(spread * np.diag(inverse))
     columns = _columns(levers, blocks.turned(line[0] + line[1] * (blocks.centre - middle)))
     explained = 1 - float(left(columns.T @ columns, columns.T @ changes.ravel(), whole)) / max(whole, 1e-300)

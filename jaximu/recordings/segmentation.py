@@ -185,7 +185,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
         intervals = np.stack([centres[first] - margin, centres[last - 1] + margin], axis=1)
         long = np.diff(intervals)[:, 0] >= options.minimum_duration
         directions = (sums[last[long]] - sums[first[long]]) / (last - first)[long, None]
-        distinct = int(len(directions) > 0) + int(np.sum(_angles(directions[:-1], directions[1:]) > _DISTINCT))
+        distinct = int(len(directions) > 0) + int((_angles(directions[:-1], directions[1:]) > _DISTINCT).sum())
         return intervals[long], distinct
 
     factors = THRESHOLDS if options.threshold is None else (options.threshold,)
@@ -215,7 +215,7 @@ def find_stops(recording: Recording) -> Segmentation | None:
     """
     scan = _Scan.of(recording, _STOP_WINDOW)
     force = scan.means[0]
-    turned = np.mean(_angles(force, np.broadcast_to(np.median(force, axis=0), force.shape)) > _UPRIGHT)
+    turned = (_angles(force, np.broadcast_to(np.median(force, axis=0), force.shape)) > _UPRIGHT).mean()
     limits = (_STEADY, SegmentationOptions.rate_limit)  # of force and rate; beyond either the unit moves
     off = [lengths_of(mean - np.median(mean, axis=0)) for mean in scan.means]
     moving = np.mean([values > limit for values, limit in zip(off, limits, strict=False)], axis=1).max()

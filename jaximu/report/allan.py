@@ -171,7 +171,7 @@ def _lowest(axes: Sequence[Identified]) -> tuple[float, float]:
     deviation = axes[0].deviation
     tau = np.geomspace(deviation.tau[0], deviation.tau[-1], 400)
     total = _mean_deviation(axes, tau)
-    index = int(np.argmin(total))
+    index = int(total.argmin())
     return tau[index], total[index]
 
 

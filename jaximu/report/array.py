@@ -108,7 +108,7 @@ def _row(unit: ArrayUnit, first: bool) -> tuple[str, ...]:
     angle = np.degrees(2 * np.arccos(min(1.0, abs(unit.rotation[0]))))
     return (
         Path(unit.name).name,
-        "the first" if first else with_interval(angle, np.degrees(np.max(unit.rotation_sigma))),
+        "the first" if first else with_interval(angle, np.degrees(unit.rotation_sigma.max())),
         "0" if first else position,
         "0" if first else with_interval(1e3 * unit.time_offset, 1e3 * unit.time_offset_sigma),
         _scatter(unit.rate_scatter, np.degrees(1.0)),

@@ -134,7 +134,7 @@ def _verdict(budget: Budget) -> Iterator[str]:
     if not len(known):
         yield "The scheme determines no parameter."
         return
-    count = np.bincount(np.argmax(shares(budget)[:, known], axis=0), minlength=len(budget.sources))
+    count = np.bincount(shares(budget)[:, known].argmax(axis=0), minlength=len(budget.sources))
     order = [int(row) for row in np.argsort(-count, kind="stable") if count[row]]
     parts = [f"{budget.sources[row].words} for {count[row]}" for row in order]
     parts[0] = f"{parts[0]} of {counted(len(known), 'parameter')}"
@@ -155,7 +155,7 @@ def _number(budget: Budget) -> tuple[str, str]:
     if not budget.sources or not known.any():
         return "not determined", "the scheme determines no parameter"
     row = budget.order()[0]
-    return _percent(float(np.mean(shares(budget)[row, known]))), (
+    return _percent(float(shares(budget)[row, known].mean())), (
         f"of the parameters' variances, on average, come from the {budget.sources[row].words}"
     )
 
@@ -196,7 +196,7 @@ def parameter_rows(budget: Budget) -> list[tuple[str, ...]]:
         if not budget.determined[index]:
             rows.append((words, "not determined", "", ""))
             continue
-        ranked = [int(row) for row in np.argsort(-part[:, index], kind="stable") if part[row, index] >= LEAST_SHARE][:3]
+        ranked = [int(row) for row in (-part[:, index]).argsort(kind="stable") if part[row, index] >= LEAST_SHARE][:3]
         made = [f"{budget.sources[row].words} {100 * part[row, index]:.0f} %" for row in ranked]
         wrong = [budget.sources[row].words for row, column in off if column == index]
         made += [f"not linear in {source}" for source in wrong]
@@ -211,8 +211,8 @@ def source_rows(budget: Budget) -> list[tuple[str, ...]]:
     rows = []
     for row in budget.order():
         source = budget.sources[row]
-        most = int(known[np.argmax(part[row, known])]) if len(known) else 0
-        mean = np.mean(part[row, known]) if len(known) else 0.0
+        most = int(known[part[row, known].argmax()]) if len(known) else 0
+        mean = part[row, known].mean() if len(known) else 0.0
         where = f"{describe(budget.names[most], budget.imu)}: {_percent(part[row, most])}"
         rows.append(
             (source.words, _stated(source.size), _percent(mean), where if part[row, most] >= 1e-3 else "nowhere")
@@ -300,7 +300,7 @@ def _figure(budget: Budget) -> Figure:
     owners = [name.owner for name in budget.names]
     columns = [group for group in _GROUPS if group in owners]
     part, order = shares(budget), budget.order()
-    visible = [row for row in order if np.any(part[row, budget.determined] >= LEAST_SHARE)][: len(PALETTE)]
+    visible = [row for row in order if (part[row, budget.determined] >= LEAST_SHARE).any()][: len(PALETTE)]
     stacked = [(budget.sources[row].words, part[row], color) for row, color in zip(visible, PALETTE, strict=False)]
     if others := [row for row in order if row not in visible]:
         stacked.append(("others", part[others].sum(axis=0), OTHERS))

@@ -151,7 +151,7 @@ def _rate_known(calibration: Calibration, extent: Range, rates: FloatArray) -> F
 def _turning(calibration: Calibration, extent: Range) -> str:
     """Say how well the corrected rate is known at rest, and at the end of the range about the worst axis."""
     half = _rate_known(calibration, extent, np.concatenate([np.zeros((1, 3)), extent.rate * _FACES]))
-    worst = 1 + int(np.argmax(half[1:]))
+    worst = 1 + int(half[1:].argmax())
     still, turning = (
         f"known to ±{number(value, 2)} °/s (95 %)" if np.isfinite(value) else "not determined"
         for value in (half[0], half[worst])

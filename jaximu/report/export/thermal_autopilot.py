@@ -167,7 +167,7 @@ class _Targets:
         written = np.vander((celsius - about)[counted], 4, increasing=True) @ (cubic * unit)
         error = written - model[counted]
         shift = 0.0 if constant else error.mean(axis=0)
-        self.loss[name] = np.sqrt(np.mean((error - shift) ** 2, axis=0))
+        self.loss[name] = np.sqrt(((error - shift) ** 2).mean(axis=0))
         if self.working is not None:
             self.left[name] = self.working.blocks.left(name, self.working.blocks.means[name] - (written - shift))
         reading = self.calibration.reading
