@@ -489,7 +489,7 @@ def _output(first: Epoch, last: Epoch, owner: str, over: float) -> OutputChange:
         float(length[worst]),
         float(np.sqrt(along @ spread[worst] @ along)),
         rms(length),
-        float(np.sqrt(np.mean(np.trace(spread, axis1=1, axis2=2)))),
+        float(np.sqrt(np.mean(spread.trace(axis1=1, axis2=2)))),
         over,
         SENSOR_UNITS[owner],
     )

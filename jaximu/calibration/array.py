@@ -150,7 +150,7 @@ class _Shared:
         start = np.arange(begin, end - length, length)
         still = ((start[:, None] < rests[:, 1]) & (start[:, None] + length > rests[:, 0])).any(axis=1)
         near = _NEAR / slowest
-        measured = np.searchsorted(unseen, start - near) == np.searchsorted(unseen, start + length + near)
+        measured = unseen.searchsorted(start - near) == unseen.searchsorted(start + length + near)
         start = start[~still & measured]
         windows = np.stack([start, start + length], axis=1)
         speed = lengths_of(means_over(gyroscopes[0], windows))
@@ -259,7 +259,7 @@ def _prior(imu: Imu, calibration: Calibration, first: Calibration, back: FloatAr
     covariance = known + blur @ first.covariance_of(names) @ blur.T + np.diag((_LITTLE * sizes) ** 2)
     # what is not known stands: it says what is turned
     axes = np.array([name.owner == "accelerometer" or name.part == "gain" for name in names])
-    covariance += np.diag(np.where(axes & (np.diagonal(known) > 0), sizes, 0.0) ** 2)
+    covariance += np.diag(np.where(axes & (known.diagonal() > 0), sizes, 0.0) ** 2)
     root = scipy.linalg.block_diag(np.linalg.inv(np.linalg.cholesky(covariance)), effects.root)
     return Prior((*names, *effects.names), np.concatenate([flatten(bare), effects.mean]), root)
 

@@ -114,7 +114,7 @@ def _most_in_common(alone: Fit, observations: Observations) -> float:
     A few turns would else do without a maximum of the likelihood: the gains that all units share run after this size.
     """
     back = np.linalg.inv(alone.imu.triads()["gyroscope"].gain)
-    noise = np.trace(back @ observations.turns.noise @ back.swapaxes(1, 2), axis1=1, axis2=2)
+    noise = (back @ observations.turns.noise @ back.swapaxes(1, 2)).trace(axis1=1, axis2=2)
     return float(np.max(alone.excess[:, EXCESS_NAMES.index("turns")] * noise) / noise[0])
 
 

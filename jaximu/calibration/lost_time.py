@@ -227,7 +227,7 @@ class _Recorded:
     def _samples(self, turn: int) -> tuple[int, int, int]:
         """Return the recording of a turn, its first sample in it and the one after its last."""
         counts = np.cumsum([len(part.intervals) for part in self.calibration.segmentations])
-        part = int(np.searchsorted(counts, turn, "right"))
+        part = int(counts.searchsorted(turn, "right"))
         poses = self.observations.poses
         ends = [poses.stop[turn], poses.start[turn + 1]]
         first, last = np.searchsorted(self.signals[part].time, ends)
@@ -325,7 +325,7 @@ def without_lost_stretches(calibration: Calibration) -> tuple[list[Recording], l
         time, left = recorded.missing(turn, off[turn])
         if not len(time) or squared[turn] <= 0:
             continue
-        rare = (1 + len(others) - np.searchsorted(others, jumps[turn])) / (1 + len(others))
+        rare = (1 + len(others) - others.searchsorted(jumps[turn])) / (1 + len(others))
         sure = (
             (_TAIL + 2) / 2 * np.log1p(squared[turn] / _TAIL)
             - np.log(2 * _SLACK * squared[turn])

@@ -243,8 +243,8 @@ def _maximise(values, covariances, mean, covariance):
         rest = means - better
         summed = rest.T @ rest + count * covariance - covariance @ weights.sum(axis=0) @ covariance
         # p units without correlations: what keeps the matrix regular when there are hardly more units than parameters
-        fresh = (summed + size * np.diag(np.diagonal(summed) / count)) / (count + size)
-        change = np.abs(np.sqrt(np.diagonal(fresh) / np.diagonal(covariance)) - 1).max()
+        fresh = (summed + size * np.diag(summed.diagonal() / count)) / (count + size)
+        change = np.abs(np.sqrt(fresh.diagonal() / np.diagonal(covariance)) - 1).max()
         mean, covariance = better, fresh
         if change < 1e-3:
             break

@@ -308,7 +308,7 @@ def prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> Run
     rows = [row for row, name in enumerate(calibration.names) if _identity(name, calibration.imu) in known]
     indices = np.array([known[_identity(calibration.names[row], calibration.imu)] for row in rows], int)
     covariance = submatrix(calibration.covariance, rows)
-    if not rows or not np.diagonal(covariance).any():
+    if not rows or not covariance.diagonal().any():
         raise NotPossibleError(
             f"{file} states no covariance, so what it leaves open is not known: calibrate the log again with "
             "`jaximu calibrate LOG -o DIR`."

@@ -296,7 +296,7 @@ def _without_gaps(since: FloatArray, until: FloatArray, start: FloatArray, stop:
     """Whether no sample between two times holds far longer than others do."""
     lengths = until - since
     long = np.cumulative_sum(lengths > 2.5 * np.median(lengths), include_initial=True)
-    return long[np.searchsorted(since, stop)] == long[np.searchsorted(until, start)]
+    return long[since.searchsorted(stop)] == long[until.searchsorted(start)]
 
 
 @compiled
@@ -624,7 +624,7 @@ def _walk(part: _Length, triad: str) -> float:
 
 def _multiples(unit: FloatArray, moment: FloatArray) -> float:
     """Return the mean of tr(unit⁻¹ moment)/3: the square of how many times the one is the other."""
-    return float(np.mean(np.trace(np.linalg.solve(unit, moment), axis1=1, axis2=2)) / 3)
+    return float(np.mean(np.linalg.solve(unit, moment).trace(axis1=1, axis2=2)) / 3)
 
 
 def _terms(part: _Length, triad: str) -> dict[str, float]:

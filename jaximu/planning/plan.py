@@ -158,7 +158,7 @@ class Known:
             gyroscope_noise=noise if "turns" in excess else None,
             excess=(
                 excess["accelerometer"] * float(np.trace(poses.accelerometer_covariance.mean(axis=0))),
-                excess.get("turns", 0.0) * duration * float(np.trace(noise)),
+                excess.get("turns", 0.0) * duration * float(noise.trace()),
                 excess.get("gyroscope", 0.0) * float(np.trace(poses.gyroscope_covariance.mean(axis=0))),
             ),
         )

@@ -94,7 +94,7 @@ def rotation_of(matrix: FloatArray) -> FloatArray:
 
 def angle_of(rotation: FloatArray) -> float:
     """Return the angle (rad) of a rotation (3, 3)."""
-    return float(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1.0, 1.0)))
+    return float(np.arccos(np.clip((rotation.trace() - 1) / 2, -1.0, 1.0)))
 
 
 def turned_between(time: FloatArray, rate: FloatArray) -> FloatArray:
@@ -147,7 +147,7 @@ def gravity_turning(
     apart, step = np.diff(centre), np.diff(rate_time)
     weight[apart > 2 * np.median(apart)] = 0.0
     for gap in np.flatnonzero(step > max(_BLOCK, 2.5 * np.median(step))):
-        first, last = np.searchsorted(centre, rate_time[gap : gap + 2])
+        first, last = centre.searchsorted(rate_time[gap : gap + 2])
         weight[max(first - 1, 0) : last] = 0.0
     return BlockMeans(centre, midpoints(mean), change, weight, rate_time, angle)
 
@@ -269,7 +269,7 @@ def carried(
     """
     from scipy.spatial.transform import Rotation
 
-    edges = np.searchsorted(force_time, rests)
+    edges = force_time.searchsorted(rests)
     up = _directions(of_each(np.mean, force, edges))
     interval = np.diff(rate_time)
     gap = 2.5 * np.median(interval)
@@ -278,7 +278,7 @@ def carried(
         stop - start < _TURN_SECONDS
         and rate_time[0] <= a
         and b <= rate_time[-1]
-        and interval[slice(*np.searchsorted(rate_time, (start, stop)))].max(initial=0.0) < gap
+        and interval[slice(*rate_time.searchsorted((start, stop)))].max(initial=0.0) < gap
         for (_, start), (stop, _), a, b in zip(rests, rests[1:], middle, middle[1:], strict=False)
     ]
     turned = dot_rows(up[1:], up[:-1]) < np.cos(TURN_ANGLE)
@@ -289,7 +289,7 @@ def carried(
     used = used[:: -(-len(used) // _MOST) or 1]
     if not len(used):
         return Carried(1.0, np.pi, 0)
-    at_rest = np.concatenate([rate[a:b] for a, b in np.searchsorted(rate_time, rests)])
+    at_rest = np.concatenate([rate[a:b] for a, b in rate_time.searchsorted(rests)])
     rate = rate - np.median(at_rest, axis=0) if len(at_rest) else rate
     angle = np.cumulative_sum(turned_between(rate_time, rate), axis=0, include_initial=True)
     passed = interpolated(rate_time, angle, np.linspace(middle[used], middle[used + 1], _TURN_STEPS + 1))

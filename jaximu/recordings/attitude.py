@@ -53,7 +53,7 @@ class Attitude:
         if not kept.all():
             notes += (f"{self.name}: {(~kept).sum()} of {len(kept)} rows hold no attitude and are left out.",)
         unit = self.quaternion[kept] / length[kept, None]
-        flips = np.concatenate([[1.0], np.cumprod(np.sign(dot_rows(unit[1:], unit[:-1]) + 1e-12))])
+        flips = np.concatenate([[1.0], np.sign(dot_rows(unit[1:], unit[:-1]) + 1e-12).cumprod()])
         return replace(self, time=self.time[kept], quaternion=unit * flips[:, None], notes=notes, **vectors)
 
     def rotation(self) -> scipy.spatial.transform.Rotation:

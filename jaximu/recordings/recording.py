@@ -722,8 +722,8 @@ def smoothed_slope(time: FloatArray, values: FloatArray, window: float) -> Float
     """
     time, values = time - time.mean(), values - values.mean()
     here = np.arange(len(time))
-    first = np.minimum(np.searchsorted(time, time - window / 2, "left"), np.maximum(here - 1, 0))
-    last = np.maximum(np.searchsorted(time, time + window / 2, "right"), np.minimum(here + 2, len(time)))
+    first = np.minimum(time.searchsorted(time - window / 2, "left"), np.maximum(here - 1, 0))
+    last = np.maximum(time.searchsorted(time + window / 2, "right"), np.minimum(here + 2, len(time)))
 
     def total(terms: FloatArray) -> FloatArray:
         running = np.cumulative_sum(terms, include_initial=True)

@@ -58,14 +58,14 @@ def evidence(calibration: Calibration) -> PoseAndTurnErrors | None:
         return np.einsum("pi,pij,pj->p", directions, matrices, directions)
 
     def tilts(matrices: FloatArray) -> FloatArray:
-        tilt = (np.trace(matrices, axis1=1, axis2=2) - along(matrices)) / 2 / gravity**2
+        tilt = (matrices.trace(axis1=1, axis2=2) - along(matrices)) / 2 / gravity**2
         return tilt[1:] + tilt[:-1]
 
     noise, total = tilts(covariance), tilts(extended)
     if used.any():
         # rotating the rate's white noise along the turn keeps its mean over the three axes
         inverse = np.linalg.inv(np.asarray(fit.imu.triads()["gyroscope"].gain))
-        density = np.trace(inverse @ np.asarray(observations.turns.noise) @ inverse.T) / 3
+        density = (inverse @ np.asarray(observations.turns.noise) @ inverse.T).trace() / 3
         turned = density * np.asarray(observations.turns.interval).sum(axis=1)
         noise, total = noise + turned, total + turned + of_turns * turned[used].mean()
 

@@ -170,7 +170,7 @@ def _started_nominal(calibration: Calibration, name: str) -> bool:
     if not calibration.segmentations or calibration.nominal is None:
         return True
     signal = getattr(calibration.segmentations[0].recording, name)
-    start = np.diagonal(np.asarray(getattr(calibration.nominal, name).gain))
+    start = np.asarray(getattr(calibration.nominal, name).gain).diagonal()
     return signal is None or np.allclose(signal.nominal_scale, start, rtol=1e-6)
 
 
