@@ -1,13 +1,10 @@
 """The page of a noise analysis: the curve, every axis's terms, the numbers that a filter takes, Kalibr's file."""
 
-from __future__ import annotations
-
 import math
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,14 +27,10 @@ from jaximu.noise.filter_noise import (
 from jaximu.noise.identification import Identified, Term
 from jaximu.recordings.readers.kalibr import kalibr_yaml
 from jaximu.recordings.recording import Source
+from jaximu.report.canvas import Axes, Figure
 from jaximu.report.figures import AXES, dressed, new_figure
 from jaximu.report.tables import written_now
 from jaximu.report.words import file_names
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 _DISCRETE_UNITS = {
     "angular_rate": ("deg/s", "rad/s"),

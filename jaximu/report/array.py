@@ -1,12 +1,9 @@
 """The page of units on one body: what averaging gains, which one disturbs, where each is and how it is turned."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -14,10 +11,8 @@ import scipy
 from jaximu.calibration.array_units import Array, ArrayUnit
 from jaximu.ground.page import Page, Picture, Statement, Table
 from jaximu.ground.quantities import number, with_interval
+from jaximu.report.canvas import Figure
 from jaximu.report.figures import AXES, dressed, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def page_of(array: Array) -> Page:

@@ -1,10 +1,7 @@
 """The page of units and sessions: each recording's verdict, what belongs to what, and common time courses."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,9 +11,7 @@ from jaximu.ground.quantities import counted, listed, number, probability, reada
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE
 from jaximu.report import figures
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from jaximu.report.canvas import Figure
 
 
 def page_of(attribution: Attribution) -> Page:

@@ -1,17 +1,10 @@
 """A unit drawn as a flat box with its axes, as the person who holds it sees it."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.report import figures
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
+from jaximu.report.canvas import Axes
 
 AXES_WORDS = (
     "Arrows are its axes, coloured faces their positive ends; dashed arrows point away from you. A minus marks the "

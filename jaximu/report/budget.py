@@ -1,13 +1,10 @@
 """The page of an error budget: what each parameter's uncertainty is made of, and what to improve."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,12 +15,8 @@ from jaximu.ground.quantities import Z95, counted, listed, number, sentence, siz
 from jaximu.planning.budget import Budget, Goal, Trials
 from jaximu.planning.setup_errors import ErrorSource
 from jaximu.report import figures
+from jaximu.report.canvas import Axes, Figure
 from jaximu.report.figures import LEAST_SHARE, OTHERS, PALETTE, dressed, legend_below
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 _GROUPS = {"accelerometer": "Accelerometer", "gyroscope": "Gyroscope", "setup": "Set-up"}
 

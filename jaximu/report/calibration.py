@@ -1,10 +1,7 @@
 """The page of a calibration: errors before and after, what to trust, every parameter, the equation to apply."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,12 +12,9 @@ from jaximu.ground.parameters import Parameter
 from jaximu.ground.quantities import Z95, change, counted, sentence, size, with_interval
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.report import figures, tables, words
+from jaximu.report.canvas import Figure
 from jaximu.report.evidence import evidence
 from jaximu.report.uncertainty import uncertainty_parts
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 _ERRORS = {
     "gravity_norm": "Error against gravity at rest",

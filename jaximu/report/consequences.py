@@ -1,13 +1,10 @@
 """The page of what errors do to navigation: the budget of position over time, tracks of draws, noise for estimators."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,11 +14,8 @@ from jaximu.ground.quantities import Z95, number, sentence
 from jaximu.navigation.consequences import Consequences, position
 from jaximu.navigation.estimator_noise import EstimatorNoise
 from jaximu.report import figures
+from jaximu.report.canvas import Figure
 from jaximu.report.figures import LEAST_SHARE, OTHERS, PALETTE, dressed, legend, legend_below
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 _SHOWN = (1.0, 10.0, 60.0, 600.0)  # s
 _COMMON = 0.1  # by how much the calibration's terms together may differ from their root sum of squares unsaid

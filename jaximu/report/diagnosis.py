@@ -1,11 +1,8 @@
 """The page of a diagnosis: what is wrong, how sure that is, what the extension gains, then the evidence."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Callable, Iterator
 from functools import cache, partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,15 +25,12 @@ from jaximu.model.effects.learned import ZERO_CELSIUS
 from jaximu.noise.deviations import deviation
 from jaximu.recordings.finding import Finding
 from jaximu.report import figures
+from jaximu.report.canvas import Axes, Figure
 from jaximu.report.figures import band, dressed, legend, zero_line
 from jaximu.report.words import compensation, file_names
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    Twin = Callable[[], tuple[Experiment, State]]
-    """The recording as the fitted model simulates it, and its fit; made when a picture first needs it."""
+Twin = Callable[[], tuple[Experiment, State]]
+"""The recording as the fitted model simulates it, and its fit; made when a picture first needs it."""
 
 
 _MEASURED, _TWIN, _EXTENDED = figures.FLAGGED, figures.BEFORE, figures.AFTER

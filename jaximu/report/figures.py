@@ -3,13 +3,11 @@
 Figures are objects; pyplot is not touched.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from functools import cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +19,11 @@ from jaximu.ground.quantities import number, raised, readable, size, unit_text
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.ground.vectors import lengths_of, root_or_zero, sigmas_of
 from jaximu.recordings.recording import Recording, Signal
+from jaximu.report.canvas import Axes, Figure
 from jaximu.report.evidence import PoseAndTurnErrors, evidence
 from jaximu.report.tables import short_name
 from jaximu.report.vector import named
 from jaximu.report.words import how_much_smaller
-
-if TYPE_CHECKING:  # matplotlib takes half a second to import: only drawing needs it
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart.
 AXES = {"x": "#0072B2", "y": "#D55E00", "z": "#009E73"}

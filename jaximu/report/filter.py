@@ -1,10 +1,7 @@
 """What a Kalman filter found, and when: in words, and as pictures of its states over time with 95 % bands."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,13 +14,10 @@ from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.effects.magnetic_field import SetupMagneticField
 from jaximu.report.attitude import mounting_words
 from jaximu.report.calibration import calibration_page
+from jaximu.report.canvas import Figure
 from jaximu.report.figures import AXES, band, dressed, legend, logarithmic, stacked, zero_line
 from jaximu.report.vehicle import vehicle_page
 from jaximu.report.words import BEYOND, gravity_statements, limits
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 _PANELS = (
     ("gyroscope", "bias", "Gyroscope bias less its last value [°/s]", np.degrees(1.0)),

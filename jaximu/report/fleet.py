@@ -1,12 +1,9 @@
 """The page of a fleet: its population, the units that do not belong, and what lots and dates change."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,13 +15,9 @@ from jaximu.ground.page import Items, Page, Part, Picture, Section, Table
 from jaximu.ground.quantities import counted, number, probability, sentence, with_interval
 from jaximu.mistakes.titles import effect_title
 from jaximu.report import figures
+from jaximu.report.canvas import Axes, Figure
 from jaximu.report.figures import dressed
 from jaximu.report.tables import MOST_ROWS
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 _UNIT, _STRANGER, _PRIOR = figures.AXES.values()
 _KINDS = (

@@ -1,12 +1,10 @@
 """The page of a guided recording while it is made: how to hold the unit next, what counted, what is still uncertain."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import partial, reduce
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup, escape
@@ -20,13 +18,10 @@ from jaximu.planning.guide import Moment
 from jaximu.planning.poses import turned_to
 from jaximu.report import figures, vector
 from jaximu.report.box import AXES_WORDS, draw_floor, draw_unit
+from jaximu.report.canvas import Figure
 from jaximu.report.html import environment, failure, packaged
 from jaximu.report.uncertainty import at_rest, poses_on_sphere, sphere_figure
 from jaximu.simulation.protocols.course import attitude_of
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 _LASTING = 1.0  # s after which a stage is shown: most take less
 _STEP = np.radians(1.0)  # change of an attitude for which the unit is drawn again

@@ -1,11 +1,9 @@
 """The page of what moved between calibrations: numbers in their uncertainties, over time, and what the output does."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +14,7 @@ from jaximu.ground.distributions import student_isf
 from jaximu.ground.page import Page, Part, Picture, Statement, Table
 from jaximu.ground.quantities import Z95, counted, number, probability, sentence, size, with_interval
 from jaximu.report import figures
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
+from jaximu.report.canvas import Axes, Figure
 
 _DRAWN = 4
 """Numbers that are drawn over time and temperature: those whose change is surest."""

@@ -1,12 +1,9 @@
 """The page of a production line: capability, control charts, alarms, what does not pass, gauge study."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,15 +15,11 @@ from jaximu.acceptance.words import amount, between, in_shown_unit, si_unit, spo
 from jaximu.ground.page import Page, Picture, Section, Table
 from jaximu.ground.quantities import Z95, counted, number, sentence, with_interval
 from jaximu.report import figures
+from jaximu.report.canvas import Axes, Figure
 from jaximu.report.certificate import item_row
 from jaximu.report.figures import dressed
 from jaximu.report.tables import MOST_ROWS
 from jaximu.report.vector import named
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 _CHARTS = 4  # drawn
 _CAPABLE, _CATEGORIES, _LEVEL = 1.33, 5, 0.01

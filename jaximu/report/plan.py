@@ -1,12 +1,10 @@
 """The page of a plan: the poses drawn, how to record them, the turns, and what they are expected to gain."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,11 +18,8 @@ from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.planning import Proposal
 from jaximu.report import figures
 from jaximu.report.box import AXES_WORDS, draw_floor, draw_unit
+from jaximu.report.canvas import Figure
 from jaximu.report.uncertainty import Known, Rest, over_sphere, sphere_figure, steady
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 _COLUMNS = 3
 _ABOVE = 0.08  # inches between the figure's edge and its title, for which the layout keeps a line

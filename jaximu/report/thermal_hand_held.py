@@ -1,10 +1,7 @@
 """The page of poses by hand over temperature: what it does to bias and scale, what remains, what may still hide."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,13 +15,10 @@ from jaximu.ground.quantities import change as changed
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE
+from jaximu.report.canvas import Figure
 from jaximu.report.figures import AFTER, AXES, BEFORE, band, dressed, legend, legend_below, new_figure, zero_line
 from jaximu.report.thermal import effect_table, files_and_next
 from jaximu.report.words import how_much_smaller
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 _POWER = {name: power for power, name in enumerate(POWERS, 1)}
 

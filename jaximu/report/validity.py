@@ -1,12 +1,9 @@
 """The report of a check: the sentence, what moved and what it does to the output, the errors before and after."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,12 +15,9 @@ from jaximu.ground.page import Page, Part, Picture, Statement, Table
 from jaximu.ground.quantities import change, listed, number, probability, sentence, with_interval
 from jaximu.mistakes.titles import effect_title
 from jaximu.report import figures
+from jaximu.report.canvas import Figure
 from jaximu.report.figures import legend, zero_line
 from jaximu.report.tables import short_name
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 _OUTPUTS = {
     "accelerometer": "accelerometer's output",

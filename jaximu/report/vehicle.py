@@ -1,11 +1,9 @@
 """The page of a vehicle that stops: the gyroscope's bias, how the unit is mounted, and what stays open."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,12 +12,9 @@ from jaximu.ground.page import Items, Page, Part, Picture, Section, Statement
 from jaximu.ground.quantities import Z95, counted, listed, size, with_interval, with_intervals
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.report.calibration import calibration_page
+from jaximu.report.canvas import Figure
 from jaximu.report.figures import AXES, band, dressed, legend, stacked, zero_line
 from jaximu.report.words import compensation, limits
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 _SURE = 4.0
 """Standard deviations from which on a change of the bias is a caution."""
