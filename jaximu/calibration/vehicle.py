@@ -86,8 +86,9 @@ def calibrate_at_stops(
     accelerometer, gyroscope = recording.accelerometer, signals["gyroscope"]
     force = rest_statistics(accelerometer, stops.intervals)[1] - accelerometer.nominal_offset
     force = force / accelerometer.nominal_scale
-    sites = _sites(stops.intervals)
-    up = _mean_direction(_by_site(force, sites))
+    # after a few seconds of motion a vehicle stands on the same slope again
+    sites = np.append(0, (stops.intervals[1:, 0] - stops.intervals[:-1, 1] > _ELSEWHERE).cumsum())
+    up = unit_vectors(np.mean(unit_vectors(_by_site(force, sites)), axis=0))
     earth, spread = _earth(up, gravity.latitude)
     longest = np.sort((-np.diff(stops.intervals)[:, 0]).argsort()[:_MOST])
     rate, history = _rate(gyroscope, stops.intervals[longest], earth, known)
@@ -249,19 +250,9 @@ def _followed(
 # --- the mounting -----------------------------------------------------------------------------------------------------
 
 
-def _sites(intervals: FloatArray) -> IntArray:
-    """Return the site (P,) of each stop: after a few seconds of motion a vehicle stands on the same slope again."""
-    return np.append(0, (intervals[1:, 0] - intervals[:-1, 1] > _ELSEWHERE).cumsum())
-
-
 def _by_site(values: FloatArray, sites: IntArray) -> FloatArray:
     """Return the mean (S, k) over each site of values (P, k) at stops."""
     return np.array([values[sites == site].mean(axis=0) for site in range(sites[-1] + 1)])
-
-
-def _mean_direction(force: FloatArray) -> FloatArray:
-    """Return the direction (3,) in which forces (P, 3) point on average."""
-    return unit_vectors(np.mean(unit_vectors(force), axis=0))
 
 
 def _mounted(

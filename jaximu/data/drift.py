@@ -125,7 +125,7 @@ def with_drift(
     whole, excess = covariance.dense(), np.asarray(fitted.excess)
     used = whole.used > 0
     weighted = submatrix(whole.total(excess), used)
-    total, sizes = fitted.covariance, fitted.sizes
+    total, sizes = np.asarray(fitted.covariance), fitted.sizes
     by_conditions = np.zeros((len(total), len(used)))
     by_conditions[:, used] = -total / sizes @ np.linalg.solve(weighted, jacobian[used]).T
     sentences: tuple[str, ...] = ()

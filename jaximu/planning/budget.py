@@ -342,7 +342,7 @@ def _expected_excess(
     units, excess = units.reshape(len(units), -1), np.zeros(len(units))
 
     def whitening(excess: FloatArray) -> FloatArray:
-        return np.linalg.inv(np.linalg.cholesky(measured + np.diag(excess @ units)))
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(measured + np.diag(excess @ units))), float)
 
     for _ in range(20):
         weights = whitening(excess)

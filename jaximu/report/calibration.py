@@ -92,7 +92,13 @@ def calibration_page(
     before those on the errors; `number`: the one number and what it is, the first error after calibration if None;
     `findings`: what else was found, for the first screen.
     """
-    trust = [*trust, *words.weak_statements(calibration.weak)]
+    trust = [
+        *trust,
+        *(
+            Statement("Weakly known" if weak.determined else "Not determined", sentence(weak.text), True)
+            for weak in calibration.weak
+        ),
+    ]
 
     def rest() -> Iterator[Part]:
         yield Section("What to trust", [statement for statement in trust if not statement.caution])

@@ -8,7 +8,6 @@ import numpy as np
 
 from jaximu.calibration import Calibration
 from jaximu.estimation.problem import Name
-from jaximu.estimation.uncertainty import WeakDirection
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.page import Statement
 from jaximu.ground.quantities import Z95, listed, number, sentence, size
@@ -180,14 +179,6 @@ def _temperature(calibration: Calibration) -> str:
         return "the temperature of the recording, which is not known"
     low, high = min(values.min() for values in warmth), max(values.max() for values in warmth)
     return f"{low:.1f} °C" if high - low < 0.1 else f"{low:.1f} to {high:.1f} °C"
-
-
-def weak_statements(weak: Sequence[WeakDirection]) -> list[Statement]:
-    """Say which directions are weak."""
-    return [
-        Statement("Weakly known" if direction.determined else "Not determined", sentence(direction.text), True)
-        for direction in weak
-    ]
 
 
 def limits(calibration: Calibration, errors: PoseAndTurnErrors | None = None) -> Iterator[Statement]:

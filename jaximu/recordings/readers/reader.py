@@ -103,7 +103,8 @@ def read_recording(
     open_columns = options.columns is None and options.gyro_columns is None
     options = _alike(options, tables[0])
     if gyro_log is None:
-        if open_columns and _of_two_files(options, tables[0]):
+        named = len(parse_columns(options.columns or ()))
+        if open_columns and (options.gyro_columns is not None or named > len(tables[0].columns)):
             raise InputError(
                 f"{tables[0].path}: the calibrated log had its gyroscope in a separate file: name this log's, too "
                 "(--gyro-log)."
@@ -188,11 +189,6 @@ def _alike(options: ReadOptions, table: LogTable) -> ReadOptions:
     mapped = Reading(axes=table.axes)
     like.require_alike(mapped if options.axes is None else mapped.mapped(options.axes), table.path, like.units)
     return options
-
-
-def _of_two_files(options: ReadOptions, table: LogTable) -> bool:
-    """Whether the columns are those of this file and of the gyroscope's."""
-    return options.gyro_columns is not None or len(parse_columns(options.columns or ())) > len(table.columns)
 
 
 def _counts(options: ReadOptions, name: str) -> tuple[Stated | None, Stated | None]:
