@@ -74,17 +74,6 @@ _FEW_SHARED, _FEW_SHARES = 10, 0.02  # rows, and share of them, from which on re
 _SHARED = 0.1  # of the messages may share a stamp
 
 
-@contextmanager
-def _noted(notes: Sequence[str]) -> Iterator[None]:
-    """Say in a refusal what reading had to assume."""
-    try:
-        yield
-    except InputError as error:
-        text = str(error.args[0])  # as it was written, before it is worded for its reader
-        more = [note[:1].upper() + note[1:] for note in notes if note not in text]
-        raise InputError(" ".join([text, *more])) from error
-
-
 def read_recording(
     path: FilePath,
     gyro_log: FilePath | None = None,
@@ -109,8 +98,12 @@ def read_recording(
                 f"{tables[0].path}: the calibrated log had its gyroscope in a separate file: name this log's, too "
                 "(--gyro-log)."
             )
-        with _noted(tables[0].notes):
+        try:
             parts = _parts(tables, options)
+        except InputError as error:
+            text = error.args[0]  # as it was written, before it is worded for its reader
+            assumed = [note[:1].upper() + note[1:] for note in tables[0].notes if note not in text]
+            raise InputError(" ".join([text, *assumed])) from error
     else:
         table, second = whole_stamps(tables[0]), whole_stamps(_read(gyro_log, options)[0])
         first_columns, second_columns = choose_pair(table, second, options.columns, options.gyro_columns)
