@@ -16,6 +16,7 @@ from jaximu.diagnosis.noise import NoiseFinding
 from jaximu.estimation.rows import TIME
 from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.page import Page, Part, Picture, Section, Statement, Table
 from jaximu.ground.quantities import Z95, change, listed, number, probability, readable, sentence, size, with_interval
 from jaximu.ground.units import SENSOR_UNITS
@@ -200,7 +201,7 @@ def _number(diagnosis: Diagnosis) -> tuple[str, str]:
         )
     index = _shown_kind(diagnosis)
     shown = diagnosis.experiment.real.kinds[index]
-    measured = np.sqrt(np.square(diagnosis.experiment.errors(diagnosis.base)[index]).mean())
+    measured = rms(diagnosis.experiment.errors(diagnosis.base)[index])
     if diagnosis.verdict == "adequate":
         meaning = f"rms of {shown.words}: no more than noise, drift and handling leave"
     else:

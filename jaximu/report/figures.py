@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.ground.array_types import BoolArray, FloatArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import number, raised, readable, size, unit_text
 from jaximu.ground.units import SENSOR_UNITS
@@ -241,17 +242,13 @@ def residuals_of(calibration: Calibration) -> Figure:
     return residual_figure(errors)
 
 
-def _rms(values: FloatArray) -> float:
-    return np.sqrt((values**2).mean())
-
-
 def residual_figure(errors: PoseAndTurnErrors) -> Figure:
     """Draw the errors by pose and by turn, before and after, with what the noise explains."""
     rows = 3 if len(errors.turn) else 2
     figure, grid = stacked(rows, 2.35, 0.0, sharex=True, height_ratios=(0.7, 1, 1)[:rows])
     pose, turn = np.arange(1, len(errors.norm_after) + 1), errors.turn + 1.5  # a turn lies between its two poses
 
-    before, after = _rms(errors.norm_before), _rms(errors.norm_after)
+    before, after = rms(errors.norm_before), rms(errors.norm_after)
     grid[0].stem(pose, errors.norm_before, linefmt=BEFORE, markerfmt="o", basefmt=" ")
     title = f"At rest the accelerometer missed gravity by {size(before, 'm/s^2')} (rms) before calibration …"
     dressed(grid[0], title, ylabel="before (m/s²)")
@@ -277,7 +274,7 @@ def residual_figure(errors: PoseAndTurnErrors) -> Figure:
         lowest = max(everything[everything > 0].min(initial=1.0), 1e-4 * everything.max())
         axes.set_ylim(0.6 * lowest, 2 * everything.max())
         logarithmic(axes, "y")
-        lost = f"by {number(_rms(errors.angle_after), 2)}° (rms), before by {number(_rms(errors.angle_before))}°"
+        lost = f"by {number(rms(errors.angle_after), 2)}° (rms), before by {number(rms(errors.angle_before))}°"
         dressed(axes, f"Over a turn the gyroscope loses gravity's direction {lost}", ylabel="angle error (°)")
         legend(grid[1], 2)
     legend_below(figure, grid[-1], 4)

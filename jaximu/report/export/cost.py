@@ -10,6 +10,7 @@ import numpy as np
 
 from jaximu.calibration import Calibration
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import size
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSOR_UNITS
@@ -202,7 +203,7 @@ def _loss(what: str, errors: dict[str, FloatArray]) -> Loss:
     return Loss(
         what,
         {name: float(length.max()) if known[name] else None for name, length in lengths.items()},
-        {name: float(np.sqrt(np.mean(length**2))) if known[name] else None for name, length in lengths.items()},
+        {name: rms(length) if known[name] else None for name, length in lengths.items()},
     )
 
 
