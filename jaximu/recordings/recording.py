@@ -148,6 +148,10 @@ class Source:
     sha256: str
     rows: int
 
+    def refused(self, why: str) -> InputError:
+        """Return what is raised where the file cannot be used, and why."""
+        return InputError(f"{self.path}: {why}")
+
 
 @dataclass(frozen=True)
 class Reading:

@@ -27,15 +27,15 @@ def column_units(
             continue
         if column.name in used:
             first = table.label(used[column.name][0])
-            raise InputError(
-                f"{table.path}: the columns {first} and {table.label(index)} are both {column.name}; "
+            raise table.refused(
+                f"the columns {first} and {table.label(index)} are both {column.name}; "
                 f"ignore one of them: {advise(table).sentence(option)}"
             )
         wanted = QUANTITIES[column.name]
         stated = column.unit or ("1" if wanted == ("ratio",) else None)
         if stated is None:
-            raise InputError(
-                f"{table.path}: column {table.label(index)} states no unit. State the units with {option}, after "
+            raise table.refused(
+                f"column {table.label(index)} states no unit. State the units with {option}, after "
                 f"checking those guessed here: {advise(table, sensor).sentence(option)}"
             )
         used[column.name] = index, unit(stated, wanted, file=table.path, column=column.name)
@@ -43,9 +43,9 @@ def column_units(
         missing = [name for name in group.columns if name not in used]
         if missing and len(missing) < len(group.columns):
             present = ", ".join(name for name in group.columns if name in used)
-            raise InputError(f"{table.path}: column {missing[0]} is missing beside {present}.")
+            raise table.refused(f"column {missing[0]} is missing beside {present}.")
         if not missing and len({used[name][1].quantity for name in group.columns}) > 1:
-            raise InputError(f"{table.path}: columns {', '.join(group.columns)} mix raw counts with physical units.")
+            raise table.refused(f"columns {', '.join(group.columns)} mix raw counts with physical units.")
     return used
 
 
@@ -65,8 +65,8 @@ def choose_columns(
 
 
 def _wrong_count(table: LogTable, count: int, option: str) -> InputError:
-    return InputError(
-        f"{table.path}: {option} names {count} columns, the file has {len(table.columns)}; "
+    return table.refused(
+        f"{option} names {count} columns, the file has {len(table.columns)}; "
         f"name each one, for example {advise(table).sentence(option)}"
     )
 

@@ -71,6 +71,10 @@ class LogTable:
         """The number in the file, 1-based, of the row at `index`."""
         return self.rows + int(index) if isinstance(self.rows, int) else int(self.rows[index])
 
+    def refused(self, why: str) -> InputError:
+        """What is raised where the file cannot be used, and why."""
+        return self.source.refused(why)
+
     def where(self, index: int | np.integer) -> str:
         """The file and the number of a row, for messages."""
         return f"{self.path}, row {self.row(index)}"

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.ground.errors import InputError
 from jaximu.ground.units import column_title, parse_column
 from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.recording import Source
@@ -38,7 +37,7 @@ def table_of(variables: Mapping[str, Any], source: Source) -> LogTable:
         elif array.ndim <= 2 and array.size > 1 and array.dtype.kind in "iufb":
             arrays.append((name, array))
     if not arrays:
-        raise InputError(f"{source.path}: holds no columns of numbers.")
+        raise source.refused("holds no columns of numbers.")
     sizes: Counter[int] = Counter()
     for _, array in arrays:  # parameters are many and short, the samples are where the numbers are
         sizes[max(array.shape)] += array.size

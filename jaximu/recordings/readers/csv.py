@@ -54,9 +54,8 @@ def read(path: Path, source: Source) -> LogTable:
     whole = head if wide else _without_zeros(path)  # None where the file stands as it is read
     head = head if wide or whole is None else whole[:HEAD]
     if len(head) != len(head.translate(None, _CONTROL)):
-        raise InputError(
-            f"{source.path}: holds binary data of no known format; expected CSV, TSV, blank-separated text, "
-            "Parquet, NPZ or MAT."
+        raise source.refused(
+            "holds binary data of no known format; expected CSV, TSV, blank-separated text, Parquet, NPZ or MAT."
         )
     layout = _layout(_lines(head), source.path)
     rows: np.ndarray | int = layout.first + 1

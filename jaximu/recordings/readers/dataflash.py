@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.ground.errors import InputError
 from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.recording import ReadOptions, Source
 
@@ -38,10 +37,10 @@ def read(path: Path, source: Source, options: ReadOptions) -> tuple[LogTable, ..
         remedy = "set LOG_BITMASK to log the IMU, or INS_RAW_LOG_OPT for every sample"
         if instances:
             remedy = f"there are instances {', '.join(map(str, instances))} (--instance)"
-        raise InputError(f"{source.path}: has no IMU messages, and no ACC with GYR, of instance {instance}; {remedy}.")
+        raise source.refused(f"has no IMU messages, and no ACC with GYR, of instance {instance}; {remedy}.")
     topic = (options.topic or ("ACC" if raw > counts.get("IMU", 0) else "IMU")).upper()
     if topic not in counts:
-        raise InputError(f"{source.path}: --topic {options.topic}: there are {', '.join(counts)} here.")
+        raise source.refused(f"--topic {options.topic}: there are {', '.join(counts)} here.")
     notes = [
         "ArduPilot axes are forward, right, down (gravity reads about -9.8 on z at rest): --axes FRD turns them.",
         f"read: {'ACC and GYR' if topic != 'IMU' else 'IMU'}, instance {instance}"

@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from jaximu.ground.errors import InputError
 from jaximu.ground.units import column_title, find_unit
 from jaximu.recordings.columns.table import HEAD, LogTable
 from jaximu.recordings.readers.clock import seconds_of
@@ -198,7 +197,7 @@ def read(data: bytes, source: Source) -> LogTable:
     sample = _of(data[:HEAD])
     rows = [] if sample is None else list(_rows(_text(data), sample))
     if sample is None or len(rows) < 2:
-        raise InputError(f"{source.path}: holds no whole samples of text with labels.")
+        raise source.refused("holds no whole samples of text with labels.")
     first, cells = zip(*rows, strict=True)
     columns = []
     names = _names(sample)
@@ -231,7 +230,7 @@ def _declared(data: bytes, source: Source, declared: re.Match[bytes]) -> LogTabl
     rows = [line.split(b",")[1:] for line in data.split(b"\n") if line.startswith(b"$IMU,")]
     whole = [row for row in rows if len(row) == len(names)]
     if len(whole) < 2:
-        raise InputError(f"{source.path}: declares columns ($COL) of $IMU, and has no rows of it.")
+        raise source.refused("declares columns ($COL) of $IMU, and has no rows of it.")
     columns = [_numbers([cell.decode().strip() for cell in column]) for column in zip(*whole, strict=True)]
     titles = [f"{name} [{unit.replace('deg C', 'degC')}]" for name, unit in zip(names, units, strict=True)]
     note = "rows of several kinds, declared by $COL and $UNIT as FlySight writes them: those of $IMU are read."

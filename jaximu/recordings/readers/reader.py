@@ -88,15 +88,14 @@ def read_recording(
     options = _sound(options)
     tables = _read(path, options)
     if tables[0].messages and options.columns is not None:
-        raise InputError(f"{tables[0].path}: names its columns and units itself; --columns is for tables.")
+        raise tables[0].refused("names its columns and units itself; --columns is for tables.")
     open_columns = options.columns is None and options.gyro_columns is None
     options = _alike(options, tables[0])
     if gyro_log is None:
         named = len(parse_columns(options.columns or ()))
         if open_columns and (options.gyro_columns is not None or named > len(tables[0].columns)):
-            raise InputError(
-                f"{tables[0].path}: the calibrated log had its gyroscope in a separate file: name this log's, too "
-                "(--gyro-log)."
+            raise tables[0].refused(
+                "the calibrated log had its gyroscope in a separate file: name this log's, too (--gyro-log)."
             )
         try:
             parts = _parts(tables, options)
@@ -112,7 +111,7 @@ def read_recording(
             extract(second, second_columns, options, set(GROUPS) - {"accel"}, "--gyro-columns"),
         ]
         if "gyro" not in parts[1].signals:
-            raise InputError(f"{second.path}: columns gyro_x, gyro_y, gyro_z are missing.")
+            raise second.refused("columns gyro_x, gyro_y, gyro_z are missing.")
     recording = _finished(parts, tables[0], options)
     if require_gyroscope and recording.gyroscope is None:
         raise InputError(
@@ -289,7 +288,7 @@ def read_means(path: FilePath, options: ReadOptions | None = None) -> PoseMeans:
     triads = {"accel": recording.accelerometer, "gyro": recording.gyroscope}
     for signal in triads.values():
         if signal is not None and len(signal) != len(table.columns[0]):
-            raise InputError(f"{table.path}: a row holds no mean of a sensor that others have; leave such rows out.")
+            raise table.refused("a row holds no mean of a sensor that others have; leave such rows out.")
     maps = parse_axes(options.axes or "FLU")
     sigma = {
         f"{GROUPS[key].field}_sigma": known @ np.abs(maps[GROUPS[key].field]).T
@@ -307,7 +306,7 @@ def _sigma_of_means(table: LogTable, sensor: str, base: str) -> FloatArray | Non
     if not there:
         return None
     if missing := [name for name in (*names, "samples") if name not in named]:
-        raise InputError(f"{table.path}: column {missing[0]} is missing beside {there[0]}.")
+        raise table.refused(f"column {missing[0]} is missing beside {there[0]}.")
 
     def positive(name: str, factor: float = 1.0) -> FloatArray:
         values = np.asarray(table.numbers(named[name][0]), float) * factor
@@ -319,10 +318,10 @@ def _sigma_of_means(table: LogTable, sensor: str, base: str) -> FloatArray | Non
     for name in names:
         stated = named[name][1]
         if stated is None:
-            raise InputError(f"{table.path}: column {name!r} states no unit.")
+            raise table.refused(f"column {name!r} states no unit.")
         known = unit_named(stated, file=table.path, column=name)
         if known.base != base:
-            raise InputError(f"{table.path}: column {name!r} is in {stated}, but the means beside it are in {base}.")
+            raise table.refused(f"column {name!r} is in {stated}, but the means beside it are in {base}.")
         deviations.append(positive(name, known.factor))
     return np.stack(deviations, axis=1) / np.sqrt(positive("samples"))[:, None]
 
@@ -398,7 +397,7 @@ def read_table(path: FilePath) -> LogTable:
     """The columns of a file that is one table. Raises InputError naming the file."""
     first, *others = read_tables(path)
     if others:
-        raise InputError(f"{first.path}: is a log of several sensors, not a table.")
+        raise first.refused("is a log of several sensors, not a table.")
     return first
 
 
@@ -513,7 +512,7 @@ def _checked(table: LogTable, source: Source) -> LogTable:
     """The table with its source and number of rows, in our names where its own show what wrote it."""
     rows = len(table.columns[0]) if table.columns else 0
     if rows < 2:
-        raise InputError(f"{table.path}: holds {counted(rows, 'row')} of data; a recording needs more.")
+        raise table.refused(f"holds {counted(rows, 'row')} of data; a recording needs more.")
     table = apart(replace(table, source=replace(source, rows=rows)))
     known = known_names(table)
     return table if known is None else replace(table, names=known[0]).noted(known[1])
@@ -574,7 +573,7 @@ def extract(
         signal, dropped = _signal(table, values, stamps)
         if dropped == len(stamps):
             if key in ("accel", "gyro"):
-                raise InputError(f"{table.path}: column {table.label(values[0][1])} is empty.")
+                raise table.refused(f"column {table.label(values[0][1])} is empty.")
             notes.append(f"{GROUPS[key].field}: the columns are empty.")
             continue
         if dropped:
@@ -651,8 +650,8 @@ def _ordered(table: LogTable, clock: int, unit: Unit) -> LogTable:
     kept = order[np.concatenate([[True], np.diff(stamps[order]) > 0])]
     shared = len(order) - len(kept)
     if shared > _SHARED * len(order):
-        raise InputError(
-            f"{table.path}: {shared} of {len(order)} messages share the stamp of another; use the other stamps "
+        raise table.refused(
+            f"{shared} of {len(order)} messages share the stamp of another; use the other stamps "
             "(--stamp receive, or --stamp header)."
         )
     table = table.take(kept)
@@ -781,7 +780,7 @@ def _stamps(table: LogTable, used: Used, options: ReadOptions) -> tuple[FloatArr
         if not rate:
             means = " A table with a row of means a pose is for `jaximu calibrate --means`."
             means = means if table.source.rows <= _TABLE else ""
-            raise InputError(f"{table.path}: has no time column; state the sample rate with --rate HZ.{means}")
+            raise table.refused(f"has no time column; state the sample rate with --rate HZ.{means}")
         return np.arange(table.source.rows) / rate, Fraction(0), [f"no time column: stamps from {origin}, {rate:g} Hz."]
     index, unit = used[TIME]
     stamps = table.numbers(index)
@@ -828,8 +827,8 @@ def _signal(table: LogTable, columns: Sequence[tuple[np.ndarray, int, Unit]], st
     if values.shape[1] == 3 and len(values) > 1:
         for axis, (_, index, _) in zip(values.T, columns, strict=True):
             if axis[0] == axis[-1] and (axis == axis[0]).all():
-                raise InputError(
-                    f"{table.path}: column {table.label(index)} never changes from {axis[0]:.6g}: nothing was "
+                raise table.refused(
+                    f"column {table.label(index)} never changes from {axis[0]:.6g}: nothing was "
                     "measured, or its steps are coarser than all that the sensor saw. Log more digits."
                 )
     return Signal(stamps, values, columns[0][2].base), rows - len(kept)

@@ -46,7 +46,7 @@ def read(data: bytes, source: Source) -> LogTable | tuple[LogTable, ...]:
         return _table({**about, **_columns(records)}, source)
     if isinstance(document, Mapping):
         return _table(dict(_leaves(document)), source)
-    raise InputError(f"{source.path}: holds no columns of numbers.")
+    raise source.refused("holds no columns of numbers.")
 
 
 def _records(document: Any) -> list[Json] | None:
@@ -137,7 +137,7 @@ def of_sensor(table: LogTable, sensor: str) -> LogTable:
         axes = {axis: Column(f"{sensor}_{axis}", _ANDROID[sensor]) for axis in "xyz"}
         columns = [axes.get(name, column) for name, column in zip(table.header, columns, strict=True)]
     if missing := set(wanted[1:]) - {column.name for column in columns}:
-        raise InputError(f"{table.path}: columns {', '.join(sorted(missing))} are missing; it has {table.header}.")
+        raise table.refused(f"columns {', '.join(sorted(missing))} are missing; it has {table.header}.")
     places = {column.name: at for at, column in enumerate(columns)}
     kept = {name: columns[places[name]].unit for name in wanted if name in places}
     names = tuple(column_title(name, unit) for name, unit in kept.items())
@@ -192,12 +192,12 @@ def of_device(table: LogTable, device: str | None, usual: str | None = None) -> 
             continue
         device = usual if device is None and usual in units else device
         if device is None:
-            raise InputError(
-                f"{table.path}: its rows are of {len(units)} units, which write in turn, by column {table.label(at)}: "
+            raise table.refused(
+                f"its rows are of {len(units)} units, which write in turn, by column {table.label(at)}: "
                 f"choose one of them, {', '.join(units[:8])}, with --device. {_all_of(table, units.tolist())}"
             )
         if device not in units:
-            raise InputError(f"{table.path}: --device {device}: column {table.label(at)} holds {', '.join(units[:8])}.")
+            raise table.refused(f"--device {device}: column {table.label(at)} holds {', '.join(units[:8])}.")
         note = f"the rows are those of {device}, by column {table.label(at)}."
         return replace(table.take(np.flatnonzero(names == device)), device=device).noted(note)
     return _unnamed_device(table, device or usual)
@@ -222,11 +222,11 @@ def _unnamed_device(table: LogTable, device: str | None) -> LogTable:
     units = list(map(str, range(1, count + 1)))
     if count == 1:
         if device is not None:
-            raise InputError(f"{table.path}: --device {device}: no column says which of several units a row is of.")
+            raise table.refused(f"--device {device}: no column says which of several units a row is of.")
         return table
     if device not in units:
-        raise InputError(
-            f"{table.path}: its rows are of {count} units, which write in turn, though no column says so: every "
+        raise table.refused(
+            f"its rows are of {count} units, which write in turn, though no column says so: every "
             f"{_ORDINALS[count]} row is alike and its neighbours differ, all along. Choose one of them with --device "
             f"1 … --device {count} (as the first rows come). {_all_of(table, units)}"
         )
@@ -297,7 +297,7 @@ def _joined(tables: list[LogTable]) -> LogTable:
     names = list(dict.fromkeys(name for part in held for name in part))
     clock = next((name for name in names if all(name in part and rises(part[name]) for part in held)), None)
     if clock is None:
-        raise InputError(f"{first.path}: the rows of its sensors share no column of time.")
+        raise first.refused("the rows of its sensors share no column of time.")
     stamps = np.unique(np.concatenate([part[clock] for part in held]))
     columns = {name: np.full(len(stamps), np.nan) for name in names}
     for part in held:

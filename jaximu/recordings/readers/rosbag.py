@@ -160,9 +160,7 @@ def _read(
     chosen = [connection for connection in bag.connections if kinds.get(connection.topic) == connection.msgtype]
     for connection in chosen:
         if connection.digest and len(connection.digest) == 32 and connection.digest != _KINDS[connection.msgtype].md5:
-            raise InputError(
-                f"{source.path}: topic {connection.topic} is a {connection.msgtype} of an unknown definition."
-            )
+            raise source.refused(f"topic {connection.topic} is a {connection.msgtype} of an unknown definition.")
     decoded = {topic: _Columns(_KINDS[kind], cdr) for topic, kind in kinds.items()}
     for connection, received, data in iterate(chosen):
         if len(data) > _LONGEST:
@@ -197,20 +195,20 @@ def _wanted(connections: Sequence[Any], source: Source, options: ReadOptions) ->
     if options.topic is not None:
         topics = [topic.strip() for topic in options.topic.split(",")]
         if unknown := [topic for topic in topics if topic not in imu]:
-            raise InputError(f"{source.path}: has no IMU topic {unknown[0]}; --topic can be {listed}.")
+            raise source.refused(f"has no IMU topic {unknown[0]}; --topic can be {listed}.")
         if len(topics) > 2:
             raise InputError("--topic: give one topic, or the accelerometer's and the gyroscope's.")
     else:  # two may differ in nothing but these words (RealSense)
         topics = sorted(imu, key=lambda topic: "gyro" in topic)
         pair = len(topics) == 2 and "accel" in topics[0] and topics[0].replace("accel", "gyro") == topics[1]
         if len(topics) > 1 and not pair:
-            raise InputError(
-                f"{source.path}: holds {len(imu)} IMU topics, {listed}: choose one with --topic, or the "
+            raise source.refused(
+                f"holds {len(imu)} IMU topics, {listed}: choose one with --topic, or the "
                 "accelerometer's and the gyroscope's as --topic A,B."
             )
     if not topics:
         kinds = sorted({connection.msgtype.replace("/msg/", "/") for connection in connections})
-        raise InputError(f"{source.path}: holds no sensor_msgs/Imu; it holds {', '.join(kinds[:20]) or 'nothing'}.")
+        raise source.refused(f"holds no sensor_msgs/Imu; it holds {', '.join(kinds[:20]) or 'nothing'}.")
     parts = [_GYRO | _ACCEL] if len(topics) == 1 else [_ACCEL, _GYRO]
     wanted = [(topic, _IMU, columns) for topic, columns in zip(topics, parts, strict=True)]
     beside = topics[0].rsplit("/", 1)[0]

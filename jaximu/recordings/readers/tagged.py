@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import pyarrow as pa
 import pyarrow.csv as pc
 
-from jaximu.ground.errors import InputError
 from jaximu.recordings.columns.table import HEAD, LogTable, from_arrow
 from jaximu.recordings.recording import ReadOptions, Source
 
@@ -67,7 +66,7 @@ def read(data: bytes, source: Source, options: ReadOptions) -> tuple[LogTable, .
         width = rows[0].count(b",") + 1
         at = [shift + cell for cell in (log.time[stamp], first, first + 1, first + 2)]
         if width <= max(at):
-            raise InputError(f"{source.path}: rows of {tag} have {width} cells, fewer than {log.program} writes.")
+            raise source.refused(f"rows of {tag} have {width} cells, fewer than {log.program} writes.")
         try:
             table = pc.read_csv(
                 pa.BufferReader(b"\n".join(rows)),
@@ -76,11 +75,11 @@ def read(data: bytes, source: Source, options: ReadOptions) -> tuple[LogTable, .
             )
         except pa.ArrowInvalid as error:
             reason = str(error).splitlines()[0][:200]
-            raise InputError(f"{source.path}: rows of {tag} cannot be read as a table: {reason}") from None
+            raise source.refused(f"rows of {tag} cannot be read as a table: {reason}") from None
         columns = map(from_arrow, table.columns)
         names = (f"time [{log.unit}]", *map(name.format, "xyz"))
         tables.append(LogTable(source, names, tuple(columns), messages=True))
     if not tables:
-        raise InputError(f"{source.path}: is a log of {log.program} without a row of accelerometer or gyroscope.")
+        raise source.refused(f"is a log of {log.program} without a row of accelerometer or gyroscope.")
     note = f"a log of {log.program} (m/s^2, rad/s): {log.notes[stamp]}; each sensor has its own time stamps."
     return replace(tables[0], notes=(note,)), *tables[1:]

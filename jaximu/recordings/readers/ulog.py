@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import counted
 from jaximu.ground.units import SENSORS
 from jaximu.recordings.columns.table import LogTable
@@ -101,13 +100,13 @@ def read(path: Path, source: Source, options: ReadOptions) -> tuple[LogTable, ..
     usable = {topic: count for topic, count in usable.items() if count > 1}
     if not usable:
         held = f"instances {', '.join(map(str, instances))}" if instances else "no such message"
-        raise InputError(
-            f"{source.path}: has no sensor_accel with sensor_gyro (as they are, or _fifo), no sensor_combined and no "
+        raise source.refused(
+            f"has no sensor_accel with sensor_gyro (as they are, or _fifo), no sensor_combined and no "
             f"vehicle_imu of instance {instance} ({held}); choose with --instance, or log them (SDLOG_PROFILE, high "
             "rate sensors)."
         )
     if options.topic is not None and options.topic not in usable:
-        raise InputError(f"{source.path}: --topic {options.topic}: there are {', '.join(usable)} here.")
+        raise source.refused(f"--topic {options.topic}: there are {', '.join(usable)} here.")
     topic = options.topic or max(usable, key=lambda name: usable[name])
     notes = ["PX4 axes are forward, right, down (gravity reads about -9.8 on z at rest): --axes FRD turns them."]
     others = [f"{name} ({count} samples)" for name, count in usable.items() if name != topic]
