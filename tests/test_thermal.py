@@ -9,7 +9,10 @@ from commands import result_of
 
 from jaximu import calibration
 from jaximu.calibration import calibrate_thermal, compensate, load_calibration
+from jaximu.calibration.thermal_linear import Held
 from jaximu.calibration.thermal_regression import multifactor
+from jaximu.calibration.thermal_selection import Candidate, best_by_axis
+from jaximu.calibration.thermal_terms import POWERS
 from jaximu.cli.app import main
 from jaximu.data import without_startup
 from jaximu.data.rest_blocks import folds_of, rest_blocks
@@ -22,7 +25,8 @@ from jaximu.planning.ramps import next_ramps
 from jaximu.recordings import write_recording
 from jaximu.recordings.flags import without_flagged
 from jaximu.recordings.readers import ReadOptions, read_recording
-from jaximu.recordings.recording import Signal
+from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.thermometer import course
 from jaximu.report.export import ExportedUnit
 from jaximu.report.export.catalogue import writer
 from jaximu.report.export.thermal_autopilot import ardupilot_parameters, px4_parameters
@@ -129,6 +133,46 @@ def test_what_bends_may_lag_too():
         assert np.all(fit.candidate.held.rms < 1.3 * fit.after)
     corrected = compensate(found.calibration, log)
     assert np.ptp(corrected.accelerometer.values[:, 1].reshape(-1, 400).mean(axis=1)) < 0.02
+
+
+def readings_of(thermometer, temperature):
+    """What a thermometer shows of a temperature, twice a second: in steps of 1 K, held for 10 s, or with noise."""
+    noise = np.random.default_rng(2).normal(size=len(temperature))
+    return {
+        "steps": np.round(temperature),
+        "flicker": np.round(temperature + 0.1 * noise),
+        "held": (temperature + 0.05 * noise)[np.arange(len(temperature)) // 20 * 20],
+        "noise": temperature + 0.5 * noise,
+    }[thermometer]
+
+
+@pytest.mark.parametrize("thermometer", ["steps", "flicker", "held", "noise"])
+def test_a_coarse_thermometer_is_no_lag(thermometer):
+    """A quadratic of the true temperature, whose readings are smoothed: no lag, rate or hysteresis comes out."""
+    rng, time = np.random.default_rng(1), np.arange(4800) / 2
+    temperature = 30 - 20 * np.cos(2 * np.pi * time / time[-1])
+    readings = readings_of(thermometer, temperature)
+    smooth = course(Signal(time, readings, "degC"))
+    assert np.std(smooth.values[:, 0] - temperature) < 0.4 * np.std(readings - temperature)
+    warmth = temperature[:, None] - 25
+    force = [0.1, 0, 9.81] + warmth * [4e-3, -2e-3, 1e-3] + warmth**2 * [2e-5, -3e-5, 1e-5]
+    force = Signal(time, force + 1e-3 * rng.normal(size=force.shape), "m/s^2")
+    log = Recording(accelerometer=force, temperature=Signal(time, readings, "degC"))
+    fit = calibrate_thermal(log, block=8.0, families=("polynomial", "all")).fits["accelerometer"]
+    assert set(fit.candidate.names) <= set(POWERS)
+    assert np.all(fit.candidate.held.rms < 4e-4)
+
+
+def test_no_model_is_taken_that_leaves_more_than_a_simpler_one():
+    """The model with a lag is far likelier, and leaves twice as much of what was left out."""
+    three = np.ones(3)
+
+    def tried(family, numbers, rms, score):
+        return Candidate(family, ((),) * 3, numbers * three, -numbers * three, Held(rms * three, score * three))
+
+    likelier = [tried("constant", 0, 9.0, -90.0), tried("cubic", 3, 1.0, 0.0), tried("thermal lag", 5, 2.0, 50.0)]
+    assert best_by_axis(likelier) == [1, 1, 1]
+    assert best_by_axis([*likelier, tried("all", 6, 0.5, 50.0)]) == [3, 3, 3]
 
 
 def test_the_residual_is_the_noise_and_the_cubic_is_not(found):

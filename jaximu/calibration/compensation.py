@@ -17,6 +17,7 @@ from jaximu.ground.quantities import listed
 from jaximu.model.sensor import Imu, Triad
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.recording import Recording, Signal, recordings_of, smoothed_slope
+from jaximu.recordings.thermometer import course
 
 _BEYOND = 0.5  # K outside the calibrated range from which a bias is extrapolated
 
@@ -31,7 +32,8 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
 
     Effects of a session or of the set-up belong to the recording that was calibrated and are left alone. Where the two
     sensors have stamps of their own, what one triad's effects need of the other is interpolated. A rate of temperature
-    is the slope of a line through `TEMPERATURE_WINDOW` seconds of the recorded temperature.
+    is the slope of a line through `TEMPERATURE_WINDOW` seconds of the recorded temperature, whose steps and noise are
+    smoothed where they are coarse.
 
     Raises `InputError` if the recording's output unit is not the one that was calibrated, the gyroscope was not, or an
     effect needs what the recording lacks.
@@ -61,7 +63,7 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
             outputs = {other: signal.at(time) for other, signal in signals.items()}
             stimulus = Stimulus(time=time)
             if recording.temperature is not None:
-                temperature = recording.temperature.at(time)[:, 0]
+                temperature = course(recording.temperature).at(time)[:, 0]
                 slope = smoothed_slope(time, temperature, TEMPERATURE_WINDOW)
                 stimulus = replace(stimulus, temperature=temperature, temperature_rate=slope)
             force = outputs["accelerometer"] if "accelerometer" in outputs else np.zeros((len(time), 3))

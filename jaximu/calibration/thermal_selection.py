@@ -236,23 +236,22 @@ def best_by_axis(candidates: Sequence[Candidate]) -> list[int]:
 
     A slow walk predicts a stretch from its neighbours nearly as well as a model does, and only the model corrects
     another recording: what the terms alone leave of the stretches left out decides between what is about as likely.
+    None is taken that leaves as much there as a simpler one does.
     """
     (plain,) = (k for k, candidate in enumerate(candidates) if candidate.family == "constant")
-    measures = np.array([(candidate.held.rms, candidate.costs, candidate.scores) for candidate in candidates])
+    measures = np.array([(one.held.rms, one.costs, one.scores, one.numbers) for one in candidates])
     chosen = []
     for axis in range(3):
-        rms, costs, scores = measures[:, :, axis].T
+        rms, costs, scores, numbers = measures[:, :, axis].T
         helps = (rms < rms[plain]) & (costs < costs[plain])
+        # a spline of few pieces is no simpler than a polynomial
+        learned = np.array([any(term.name == LEARNED for term in one.model[axis]) for one in candidates])
+        simplest = np.lexsort((-scores, numbers, learned))
+        helps[simplest[1:]] &= rms[simplest[1:]] < np.minimum.accumulate(rms[simplest])[:-1]
         helps[plain] = True
         close = helps & (scores > scores[helps].max() - PAYS)
         close &= rms <= _ALIKE * rms[close].min()
-
-        def complexity(k: int, axis: int = axis) -> tuple[bool, float, float]:
-            # a spline of few pieces is no simpler than a polynomial
-            learned = any(term.name == LEARNED for term in candidates[k].model[axis])
-            return learned, candidates[k].numbers[axis], -measures[k, 2, axis]
-
-        chosen.append(min(np.flatnonzero(close).tolist(), key=complexity))
+        chosen.append(int(simplest[close[simplest]][0]))
     return chosen
 
 

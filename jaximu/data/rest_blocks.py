@@ -24,6 +24,7 @@ from jaximu.model.processes import RATIO, correlation_times
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.columns.names import COUNTS_ADVICE
 from jaximu.recordings.recording import Recording, Signal, recordings_of, same_outputs, smoothed_slope
+from jaximu.recordings.thermometer import course
 
 LEAST_RANGE = 3.0
 """K of change below which nothing is said about temperature."""
@@ -365,7 +366,7 @@ def joined(parts: Sequence[RestBlocks]) -> RestBlocks:
 
 def _cut(recording: Recording, block: float) -> RestBlocks:
     """Return block means of one recording, and its temperature's path."""
-    accelerometer, temperature = recording.accelerometer, recording.signals["temperature"]
+    accelerometer, temperature = recording.accelerometer, course(recording.signals["temperature"])
     half = 0.5 / accelerometer.rate  # a sample stands for the time about its stamp
     begin, end = float(accelerometer.time[0]) - half, float(accelerometer.time[-1]) + half
     nodes = max(int(np.ceil((end - begin) / block * _NODES)), 2)
