@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+import scipy
 
 from jaximu.cli import allan as command
 from jaximu.cli import main
@@ -193,6 +194,27 @@ def with_magnetometer(field: np.ndarray) -> Recording:
     recording = at_rest(120.0)
     noise = 0.05 * np.sqrt(20.0) * np.random.default_rng(3).standard_normal((len(field), 3))
     return replace(recording, magnetometer=Signal(np.arange(len(field)) / 20.0, field + noise, "uT"))
+
+
+ONE_POLE = 1 - np.exp(-2 * np.pi * 20 / 200)
+
+
+@pytest.mark.parametrize(
+    ("rate", "top", "bottom"),
+    [(200.0, [ONE_POLE], [1, ONE_POLE - 1]), (100.0, [0.72], [1, -0.28]), (400.0, *scipy.signal.butter(2, 41 / 200))],
+    ids=["20 of 200 Hz", "20 of 100 Hz", "second order"],
+)
+def test_a_low_pass_hides_no_white_noise_and_shows_no_line(rate, top, bottom):
+    """A filter too wide to matter to a hand: the noise is that below it, and rounding above it is no line."""
+    random = np.random.default_rng(1)
+    noise = 1e-3 * np.sqrt(rate) * random.normal(size=(round(600 * rate), 3))
+    values = scipy.signal.lfilter(top, bottom, noise, axis=0)[1000:] + [0.1, 0.2, 9.8]
+    signal = Signal(np.arange(len(values)) / rate, np.round(values, 9), "m/s^2")
+    analysis = analyse_noise(Recording(accelerometer=signal))
+    white = [axis.terms["N"].value for axis in analysis.axes["accelerometer"]]
+    assert np.mean(white) == pytest.approx(1e-3, rel=0.04)
+    assert any("low-pass filter" in note for note in analysis.notes)
+    assert not any("periodic" in note for note in analysis.notes)
 
 
 def test_a_magnetometer_has_its_noise_too(tmp_path, capsys):

@@ -28,7 +28,7 @@ def find(samples: Samples) -> Iterator[Finding]:
         spectrum = np.fft.rfft(parts.swapaxes(1, 2) * np.hanning(parts.shape[1]), axis=2)
         power = np.mean(spectrum.real**2 + spectrum.imag**2, axis=0).T
         yield from _lines(sensor, parts, power)
-        yield from _bandwidth(samples, sensor, power, parts.shape[1])
+        yield from _bandwidth(samples, sensor, power, *parts.shape[:2])
 
 
 def _lines(sensor: Sensor, parts: FloatArray, power: FloatArray) -> Iterator[Finding]:
@@ -82,14 +82,18 @@ def _beside(power: FloatArray) -> FloatArray:
 
 _FALL = 0.12
 """Noise density near half the rate over that at low frequencies, below which a filter shows."""
+_FALL_AT_REST = 0.35
+"""The same of a unit at rest, whose spectrum is noise alone: one pole at 0.4 times half the rate leaves 0.31."""
+_SURE = 10.0
+"""Nats that a pole must explain of a spectrum at rest beyond what a power of frequency does."""
 _HARMLESS = 20.0
-"""Hz from which on a filter does nothing to motion by hand."""
+"""Hz from which on a filter does nothing to motion by hand; at rest it changes the noise at any corner."""
 _SLOPE = -1.2
 """Slope of the logarithm of the density over that of frequency in the upper part: white noise has 0, one pole −2."""
 
 
-def _bandwidth(samples: Samples, sensor: Sensor, power: FloatArray, width: int) -> Iterator[Finding]:
-    """A spectrum (f, 3), of parts of so many samples, that falls off far below half the rate."""
+def _bandwidth(samples: Samples, sensor: Sensor, power: FloatArray, count: int, width: int) -> Iterator[Finding]:
+    """A spectrum (f, 3), of so many parts of so many samples, that falls off far below half the rate."""
     if held_at(sensor) is not None or interpolated_at(sensor) is not None:
         return
     if np.any(sensor.noise < 3 * sensor.step) and any(sensor.coarse):
@@ -106,14 +110,15 @@ def _bandwidth(samples: Samples, sensor: Sensor, power: FloatArray, width: int) 
             continue
         upper = (frequency > 0.3 * half) & (frequency < 0.95 * half)
         top = np.median(density[frequency > 0.85 * half])
-        if top > _FALL * low:
+        if top > (_FALL_AT_REST if samples.rested else _FALL) * low:
             continue
         slope = np.polyfit(np.log(frequency[upper]), np.log(np.maximum(density[upper], floor[axis] + 1e-30)), 1)[0]
         below = np.flatnonzero(scipy.ndimage.median_filter(density, 3, mode="constant")[2:] < low / 2) + 2
         corner = float(frequency[below[0]]) if len(below) else half
         # a corner far below: what is left above may be flat again, by rounding or by an imperfect filter
         deep = top < 1e-3 * low and top < 30 * floor[axis]
-        if (slope < _SLOPE or deep) and corner < min(0.45 * half, _HARMLESS):
+        falls = slope < _SLOPE or (samples.rested and _has_pole(density, count))
+        if (falls or deep) and corner < (0.6 * half if samples.rested else min(0.45 * half, _HARMLESS)):
             corners.append(corner)
     if len(corners) < 3 or max(corners) > 2 * min(corners):  # a filter acts on all axes alike
         return
@@ -132,6 +137,19 @@ def _bandwidth(samples: Samples, sensor: Sensor, power: FloatArray, width: int) 
         spoils=spoils,
         numbers={sensor.name: corner},
     )
+
+
+def _has_pole(density: FloatArray, count: int) -> bool:
+    """Whether one pole explains the mean (f,) of so many spectra better than a power of frequency, as drift has."""
+    index = np.arange(_LOBE + 1, len(density) - 1)
+    turn = np.sin(np.pi / 2 * index / (len(density) - 1)) ** 2
+
+    def cost(shape: FloatArray) -> float:
+        """Minus the log-likelihood (Whittle's) of a shape of the spectrum, nats."""
+        return count * len(index) * float(np.mean(np.log(shape)) + np.log(np.mean(density[index] / shape)))
+
+    poles = [cost(1 / (1 + turn / corner)) for corner in np.geomspace(turn[0], 1.0, 30)]
+    return min(poles) + _SURE < min(cost(index**-power) for power in np.linspace(0.0, 3.0, 31))
 
 
 def _still_parts(samples: Samples, sensor: Sensor) -> FloatArray | None:
