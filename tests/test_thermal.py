@@ -18,6 +18,7 @@ from jaximu.data import without_startup
 from jaximu.data.rest_blocks import folds_of, rest_blocks
 from jaximu.estimation.problem import Name
 from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.mistakes import inspect
 from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import AxisNoise
@@ -146,18 +147,38 @@ def readings_of(thermometer, temperature):
     }[thermometer]
 
 
+def warmed(temperature, readings):
+    """An accelerometer at rest, twice a second, whose output is a quadratic of the true temperature."""
+    warmth, time = temperature[:, None] - 25, np.arange(len(temperature)) / 2
+    force = [0.1, 0, 9.81] + warmth * [4e-3, -2e-3, 1e-3] + warmth**2 * [2e-5, -3e-5, 1e-5]
+    force = Signal(time, force + 1e-3 * np.random.default_rng(1).normal(size=force.shape), "m/s^2")
+    return Recording(accelerometer=force, temperature=Signal(time, readings, "degC"))
+
+
+@pytest.mark.parametrize("noise", [0.05, 0.0])
+def test_a_stuck_thermometer_is_left_out(noise):
+    """It had noise and has none any more; one without noise may stand still in a soak."""
+    temperature = np.interp(np.arange(4800), [0, 2000, 4800], [20.0, 40.0, 60.0])
+    readings = np.round(temperature + noise * np.random.default_rng(1).normal(size=4800), 2)
+    readings[3000:4000] = readings[2999]
+    log = warmed(temperature, readings)
+    blocks = rest_blocks(log, 4.0)
+    left_out = (blocks.start > 1500) & (blocks.stop < 2000)
+    notes = [finding for finding in inspect(log) if finding.name == "data.stuck_axis"]
+    if noise:
+        assert not left_out.any() and len(blocks) > 460
+        assert "for 500 s in all" in notes[0].text and notes[0].text in blocks.notes
+    else:
+        assert left_out.sum() > 100 and not notes
+
+
 @pytest.mark.parametrize("thermometer", ["steps", "flicker", "held", "noise"])
 def test_a_coarse_thermometer_is_no_lag(thermometer):
     """A quadratic of the true temperature, whose readings are smoothed: no lag, rate or hysteresis comes out."""
-    rng, time = np.random.default_rng(1), np.arange(4800) / 2
-    temperature = 30 - 20 * np.cos(2 * np.pi * time / time[-1])
+    temperature = 30 - 20 * np.cos(np.linspace(0.0, 2 * np.pi, 4800))
     readings = readings_of(thermometer, temperature)
-    smooth = course(Signal(time, readings, "degC"))
-    assert np.std(smooth.values[:, 0] - temperature) < 0.4 * np.std(readings - temperature)
-    warmth = temperature[:, None] - 25
-    force = [0.1, 0, 9.81] + warmth * [4e-3, -2e-3, 1e-3] + warmth**2 * [2e-5, -3e-5, 1e-5]
-    force = Signal(time, force + 1e-3 * rng.normal(size=force.shape), "m/s^2")
-    log = Recording(accelerometer=force, temperature=Signal(time, readings, "degC"))
+    log = warmed(temperature, readings)
+    assert np.std(course(log.temperature).values[:, 0] - temperature) < 0.4 * np.std(readings - temperature)
     fit = calibrate_thermal(log, block=8.0, families=("polynomial", "all")).fits["accelerometer"]
     assert set(fit.candidate.names) <= set(POWERS)
     assert np.all(fit.candidate.held.rms < 4e-4)

@@ -18,7 +18,7 @@ from jaximu.ground.distributions import robust_sigma
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import sentence
 from jaximu.ground.vectors import column_lengths, lengths_of
-from jaximu.mistakes import prepared
+from jaximu.mistakes import Prepared, prepared
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.processes import RATIO, correlation_times
 from jaximu.model.stimulus import Stimulus
@@ -284,21 +284,22 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
     for recording in logs:
         _require_temperature(recording)
     with prepared(logs, gyroscope=False, gravity=False) as ready:
-        blocks = _of_ready([one.recording for one in ready], block)
+        blocks = _of_ready(ready, block)
     findings = [note for one in ready for note in one.notes]
     return replace(blocks, notes=tuple(dict.fromkeys((*blocks.notes, *findings))))
 
 
-def _of_ready(logs: Sequence[Recording], block: float | None) -> RestBlocks:
+def _of_ready(ready: Sequence[Prepared], block: float | None) -> RestBlocks:
     """The blocks of recordings that were looked over."""
-    used = [without_startup(recording) for recording in logs]
+    used = [without_startup(one.recording) for one in ready]
     span = sum(float(np.ptp(part.accelerometer.time)) for part in used)
     rate = min(part.accelerometer.rate for part in used)
     if block is None:
         block = max(span / _MOST_BLOCKS, 8 / rate, 1.0)
     elif not (np.isfinite(block) and block >= 2 / rate):
         raise InputError(f"a block of {block:g} s holds less than two samples at {rate:g} Hz: state a longer one.")
-    blocks = joined([_cut(recording, block) for recording in used])
+    lost = [one.left_out.get("temperature", np.zeros(0)) for one in ready]
+    blocks = joined([_cut(recording, block, stamps) for recording, stamps in zip(used, lost, strict=True)])
     count = len(blocks)
     if count > 3 * _MOST_BLOCKS:
         raise InputError(
@@ -364,8 +365,11 @@ def joined(parts: Sequence[RestBlocks]) -> RestBlocks:
     )
 
 
-def _cut(recording: Recording, block: float) -> RestBlocks:
-    """Return block means of one recording, and its temperature's path."""
+def _cut(recording: Recording, block: float, lost: FloatArray) -> RestBlocks:
+    """Return block means of one recording, and its temperature's path.
+
+    **Arguments:** `lost` (k,): stamps of temperatures that were no measurement; where a block has no others, it goes.
+    """
     accelerometer, temperature = recording.accelerometer, course(recording.signals["temperature"])
     half = 0.5 / accelerometer.rate  # a sample stands for the time about its stamp
     begin, end = float(accelerometer.time[0]) - half, float(accelerometer.time[-1]) + half
@@ -388,6 +392,8 @@ def _cut(recording: Recording, block: float) -> RestBlocks:
         scatter = sum(np.bincount(at, column, count) for column in ((values - mean[at]) ** 2).T) / safe
         moved |= scatter > _MOVING * (np.median(scatter[good]) if good.any() else 0.0)
         means[name] = mean
+    parts = begin + block * np.arange(count + 1)
+    good &= (np.histogram(lost, parts)[0] == 0) | (np.histogram(temperature.time, parts)[0] > 0)
     keep = np.flatnonzero(good & ~moved)
     means = {name: values[keep] for name, values in means.items()}
     jumps = lengths_of(np.diff(means["accelerometer"], axis=0)) > _TURNED

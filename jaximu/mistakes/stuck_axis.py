@@ -11,7 +11,7 @@ from jaximu.mistakes.base import HUNG, Samples, Sensor
 from jaximu.mistakes.clipping import at_limits, stops
 from jaximu.mistakes.resampled import held_at
 from jaximu.recordings.finding import Finding, Rows
-from jaximu.recordings.recording import runs_of
+from jaximu.recordings.recording import Signal, runs_of
 
 TITLES = {"data.stuck_axis": "stuck output"}
 
@@ -19,11 +19,43 @@ _STUCK = 0.5
 """Seconds for which an axis may repeat one value while others change."""
 _SHORTEST = 0.2
 """Seconds for which a sensor may repeat all of its values, of `HUNG` rows at least."""
+_STOOD, _TIMES = 60.0, 20
+"""Seconds for which a thermometer that has noise may repeat a reading, if not so many times as long as it usually does:
+half of its readings differ from the one before."""
+_REVERSED, _LARGER = 0.3, 0.1
+"""Shares of a thermometer's changes that go back and that exceed its step, from which on it has noise: white noise has
+0.67 and, where its standard deviation is a step, 0.2."""
 
 
 def find(samples: Samples) -> list[Finding]:
     """Return the axes that are stuck, sensors that hung, and rows that repeat as a whole."""
-    return [finding for sensor in samples.sensors.values() for finding in _stuck(sensor)]
+    findings = [finding for sensor in samples.sensors.values() for finding in _stuck(sensor)]
+    return [*findings, *_stuck_thermometer(samples.recording.temperature)]
+
+
+def _stuck_thermometer(signal: Signal | None) -> Iterator[Finding]:
+    """Return where a thermometer that has noise repeats a reading; one without may stand still in a soak."""
+    readings = np.zeros(0) if signal is None else signal.values[:, 0]
+    edges = np.flatnonzero(np.diff(readings, prepend=np.nan, append=np.nan))
+    jumps = np.diff(readings[edges[:-1]])
+    if signal is None or len(jumps) < HUNG or np.mean(jumps[1:] * jumps[:-1] < 0) < _REVERSED:
+        return
+    if np.mean(np.abs(jumps) > 1.5 * np.min(np.abs(jumps))) < _LARGER:
+        return
+    runs, length = np.stack([edges[:-1], edges[1:] - 1], axis=1), np.diff(edges)
+    stuck = runs[(length > _TIMES * np.quantile(length, 0.99)) & (np.diff(signal.time[runs])[:, 0] > _STOOD)]
+    if not len(stuck):
+        return
+    first, rows = stuck[0, 0], _repeating(stuck)
+    yield Finding(
+        "data.stuck_axis",
+        (int(first) + 1,),
+        f"temperature: it repeats one reading for {np.sum(np.diff(signal.time[stuck])):.3g} s in all, first "
+        f"{readings[first]:.4g} °C after {signal.time[first]:.1f} s, while elsewhere its noise changes it: the "
+        "thermometer or its driver hung. These readings are left out; without them nothing shows what the temperature "
+        "does there.",
+        without={"temperature": rows},
+    )
 
 
 def _stuck(sensor: Sensor) -> list[Finding]:
