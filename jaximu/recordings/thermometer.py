@@ -68,7 +68,7 @@ class _Stays:
 def _cells(time: FloatArray, values: FloatArray, count: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the mean time and value of each part that has readings, which stand for so many rows, and its rows."""
     _, cell = np.unique(np.floor((time - time[0]) / np.ptp(time) * _CELLS), return_inverse=True)
-    rows = np.bincount(cell, count)
+    rows = np.asarray(np.bincount(cell, count), np.float64)
     return np.bincount(cell, count * time) / rows, np.bincount(cell, count * values) / rows, rows
 
 
