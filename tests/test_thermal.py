@@ -1,6 +1,7 @@
 """Bias over temperature: what was put into a chamber comes out; what one ramp cannot tell, and bad input, is said."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -335,14 +336,15 @@ def test_slow_noise_does_not_pass_for_temperature():
 
 
 def test_a_jump_is_said(one_way, found):
-    """Inside the rest the gyroscope's y output steps by 0.1 °/s; without it no jump is spoken of."""
+    """Inside the rest the gyroscope's y output steps by 0.1 °/s, its z output by a fifth; else no jump is spoken of."""
     assert not any("jumps" in note for note in found.notes)
     assert one_way.gyroscope is not None
-    values = one_way.gyroscope.values + np.radians(0.1) * (one_way.gyroscope.time > 1000.0)[:, None] * [0, 1, 0]
+    values = one_way.gyroscope.values + np.radians(0.1) * (one_way.gyroscope.time > 1000.0)[:, None] * [0, 1, -0.2]
     stepped = replace(one_way, gyroscope=replace(one_way.gyroscope, values=values))
     jumping = calibrate_thermal(stepped, families=("cubic",))
     (said,) = (note for note in jumping.notes if "jumps" in note)
-    assert 0.08 < float(said.split("y output jumps by ")[1].split(" °/s")[0]) < 0.12
+    sizes = re.search(r"gyroscope's output jumps by (\S+) °/s \(y\) and −(\S+) °/s \(z\)", said)
+    assert np.allclose([float(size) for size in sizes.groups()], [0.1, 0.02], rtol=0, atol=0.004)
     assert "at 1000 s" in said.replace("999 s", "1000 s")
     # what is said to be left is what `compensate` leaves, the jump included
     left = compensate(jumping.calibration, stepped).gyroscope

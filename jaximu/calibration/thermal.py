@@ -32,13 +32,13 @@ from jaximu.estimation.fitting import effect_numbers
 from jaximu.estimation.problem import Name
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.track import TEMPERATURE_WINDOW, Track
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
-from jaximu.ground.quantities import size
+from jaximu.ground.quantities import listed, size
 from jaximu.ground.tracing import on_host
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
 from jaximu.ground.vectors import root_or_zero, submatrix
@@ -53,7 +53,7 @@ THERMAL = (*POWERS, *RATES, *HISTORY, *BESIDE, LEARNED, NETWORK, SCALE)
 _GRID = 41
 _LONG = 1e6  # s that a steady way has lasted
 _BESIDE, _FEWEST = 4, 40  # blocks on each side of a jump; edges from which on jumps are sought
-_JUMP = 10.0  # times the standard deviation of such changes
+_JUMP, _WITH_IT = 10.0, 5.0  # times the standard deviation of such changes: of a jump, and of another axis beside it
 _SHARP = 0.75  # share of the change that two blocks must see of it
 _MOST_JUMPS = 8
 _MISFIT = 1.5
@@ -180,7 +180,7 @@ def calibrate_thermal(
         raise InputError(f"the recording at rest has no {missing[0]}, whose noise is needed.")
     shapes = ThermalShapes(blocks, reference)
     noise, residuals = _noise(blocks, shapes, known)
-    edges, jumps = _jumps(blocks, residuals)
+    edges, whole = _jumps(blocks, residuals), blocks
     if edges:  # what comes after a jump has a level of its own
         blocks = blocks.parted(edges)
         shapes = ThermalShapes(blocks, reference, shapes)
@@ -202,7 +202,7 @@ def calibrate_thermal(
     notes = [*blocks.notes, *noise.notes, *notes]
     for name, fit in fits.items():
         notes += _notes(name, fit, "stretches" if len(identifiability.legs) < WAYS else "ways")
-    notes = tuple(dict.fromkeys((*notes, *jumps)))
+    notes = tuple(dict.fromkeys((*notes, *_told_jumps(whole, fits, edges))))
     times = tuple((int(blocks.log[edge]), float(blocks.start[edge])) for edge in edges)
     calibration = replace(calibration, notes=notes)
     return ThermalCalibration(calibration, blocks, noise, identifiability, fits, reference, notes, times)
@@ -271,38 +271,58 @@ def _noise(
     return own_noise(blocks, np.concatenate(columns).T) if known is None else noise, residuals
 
 
-def _jumps(blocks: RestBlocks, residuals: dict[str, FloatArray]) -> tuple[list[int], list[str]]:
-    """Return the blocks before which what a model leaves jumps inside a rest, by far more than elsewhere, and say so.
+def _jumps(blocks: RestBlocks, residuals: dict[str, FloatArray]) -> list[int]:
+    """Return the blocks before which what a model leaves jumps inside a rest, by far more than elsewhere.
 
     **Arguments:** `residuals`: by triad (n, 3), SI.
     """
-    edges = np.arange(_BESIDE, len(blocks) - _BESIDE + 1)
-    edges = edges[blocks.level[edges - _BESIDE] == blocks.level[edges + _BESIDE - 1]]
-    if len(edges) < _FEWEST:
-        return [], []
-    around = edges[:, None] + np.arange(_BESIDE)
     jumps: list[int] = []
-    notes = []
-    for name, residual in residuals.items():
-        change = np.median(residual[around], axis=1) - np.median(residual[around - _BESIDE], axis=1)
-        usual = np.maximum(np.median(np.abs(change), axis=0) / 0.6745, 0.05 * np.std(change, axis=0))  # coarse steps
-        times = np.abs(change) / np.maximum(usual, 1e-300)
+    for residual in residuals.values():
+        edges, change, usual = _changes(blocks, residual)
+        if len(edges) < _FEWEST:
+            return []
+        times = np.abs(change) / usual
         # a jump is over within two blocks; what takes longer is a lag that was not in equilibrium
         near = [np.abs(residual[edges + b] - residual[edges + a]) for a, b in ((-1, 0), (-1, 1), (-2, 0))]
         times[np.max(near, axis=0) < _SHARP * np.abs(change)] = 0.0
-        while len(notes) < _MOST_JUMPS and np.max(times) > _JUMP:
-            row, axis = np.unravel_index(int(np.argmax(times)), times.shape)
-            block = int(edges[row])
-            notes.append(
-                f"the {name}'s {'xyz'[axis]} output jumps by {size(float(change[row, axis]), SENSOR_UNITS[name], 2)} "
-                f"at {blocks.start[block]:.0f} s, {blocks.temperature[block]:.1f} °C, {times[row, axis]:.0f} times the "
-                "usual change: a knock, or a part that gave way. It was kept apart from temperature: what comes after "
-                "has its own bias. `compensate` leaves the jump in."
-            )
+        while len(jumps) < _MOST_JUMPS and np.max(times) > _JUMP:
+            block = int(edges[int(np.argmax(np.max(times, axis=1)))])
             jumps.append(block)
             times[np.abs(edges - block) < 2 * _BESIDE] = 0.0
     jumps.sort()
-    return [after for before, after in pairwise([-2 * _BESIDE, *jumps]) if after - before >= 2 * _BESIDE], notes
+    return [after for before, after in pairwise([-2 * _BESIDE, *jumps]) if after - before >= 2 * _BESIDE]
+
+
+def _changes(blocks: RestBlocks, values: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return the blocks (k,) inside rests, how values (n, 3) change before each, and a usual change of an axis (3,)."""
+    edges = np.arange(_BESIDE, len(blocks) - _BESIDE + 1)
+    edges = edges[blocks.level[edges - _BESIDE] == blocks.level[edges + _BESIDE - 1]]
+    if not len(edges):
+        return edges, np.zeros((0, 3)), np.ones(3)
+    around = edges[:, None] + np.arange(_BESIDE)
+    change = np.median(values[around], axis=1) - np.median(values[around - _BESIDE], axis=1)
+    usual = np.maximum(np.median(np.abs(change), axis=0) / 0.6745, 0.05 * np.std(change, axis=0))  # coarse steps
+    return edges, change, np.maximum(usual, 1e-300)
+
+
+def _told_jumps(blocks: RestBlocks, fits: Mapping[str, TriadFit], jumps: Sequence[int]) -> list[str]:
+    """Say by how much outputs jump before some blocks, with what temperature adds taken off as it was fitted beside."""
+    notes = []
+    for name, fit in fits.items():
+        edges, change, usual = _changes(blocks, blocks.means[name] - fit.fitted)
+        for block in jumps:
+            by_axis = change[np.searchsorted(edges, block)]
+            times = np.abs(by_axis) / usual
+            axes = np.flatnonzero(times > _WITH_IT)
+            if len(axes):
+                by = [f"{size(float(by_axis[axis]), SENSOR_UNITS[name], 2)} ({'xyz'[axis]})" for axis in axes]
+                notes.append(
+                    f"the {name}'s output jumps by {listed(by)} at "
+                    f"{blocks.start[block]:.0f} s, {blocks.temperature[block]:.1f} °C, {np.max(times):.0f} times the "
+                    "usual change: a knock, or a part that gave way. It was kept apart from temperature: what comes "
+                    "after has its own bias. `compensate` leaves the jump in."
+                )
+    return notes
 
 
 def _from_reference(fit: TriadFit, signal: Signal, reference: float) -> TriadFit:
