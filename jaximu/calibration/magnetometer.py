@@ -89,6 +89,11 @@ _ALIKE_ERRORS = (
     "the field's strength differs from its mean for seconds at a time, as beside iron or where a sensor drifts: the "
     "intervals allow for it."
 )
+_NO_ONE_FIELD = (
+    "after calibration the field's strength still scatters by {:.2g} % (rms): the field was not the same throughout. "
+    "Iron, a magnet or a current was near for much of the recording, the unit was carried elsewhere, or the sensor "
+    "drifts. Record again in one place, away from them."
+)
 _OTHER_DIP = (
     "the field points {off:.2g}° off the stated dip of {dip:.3g}°: iron nearby bends it, or the place is another. The "
     "dip was not used, and the strength is taken to be off by as much ({strength:.2g} µT, one standard deviation): "
@@ -241,6 +246,8 @@ def _calibrated(
     spreads, headings = _left_out(fit, start, windows, field, full, _samples(logs, parts))
     dip, dip_sigma = _dip(windows, fit)
     notes += stretches
+    if (scatter := _spread(fit.imu, windows, known) / known) > _STEP:
+        notes.append(_NO_ONE_FIELD.format(100 * scatter))
     if headings is not None and headings["after"] > _WORSE * headings["before"]:
         notes.append(_NO_BETTER.format(**headings))
     if dip is not None and dip < 0 and southern is None:
@@ -591,7 +598,7 @@ def _undisturbed(
     left = ~windows.used
     note = (
         f"the field is disturbed in {left.sum()} of {len(left)} windows, {_spans(whole.time[left])}; they were left "
-        "out. Iron, a magnet or a current came near."
+        "out. Iron, a magnet or a current came near, or a jerk tilted the measured vertical."
     )
     return fit, windows, [note] if left.any() else []
 
@@ -600,16 +607,19 @@ def _disturbed(imu: Imu, windows: FieldWindows, whole: FieldWindows) -> BoolArra
     """Return in which of `whole` (n,) the field is another than in `windows`, by its strength or its angle to gravity.
 
     What is next to such a window is asked at a lower level, and what lies between two is one, too: a disturbance that
-    turns past the field changes for a moment neither.
+    turns past the field changes for a moment neither. Where the vertical leaves the one that the gyroscope carries from
+    the windows beside it, it is the hand that shakes, and the angle may be off by as much.
     """
     field, noise, size = whole.field(imu), _white(imu, whole), np.zeros(len(whole))
     length = lengths_of(field)
     dip = dot_rows(whole.up, field) / length
-    for values, known, least in ((length, whole.used, noise), (dip, whole.calm, noise / np.median(length))):
+    moved = whole.turn * lengths_of(np.einsum("nij,nj->ni", whole.carried, np.roll(whole.up, -1, axis=0)) - whole.up)
+    shaken = np.maximum(moved, np.roll(moved, 1))
+    for values, known, least in ((length, whole.used, noise), (dip, whole.calm, shaken + noise / np.median(length))):
         usual = known & windows.used
         if usual.any():
             off = np.where(known, np.abs(values - np.median(values[usual])), 0.0)
-            size = np.maximum(size, off / max(robust_sigma(off[usual]), least))
+            size = np.maximum(size, off / np.maximum(robust_sigma(off[usual]), least))
     far = scipy.ndimage.binary_propagation(size > _DISTURBED, mask=size > _BESIDE)
     return far | scipy.ndimage.binary_closing(far, np.ones(_BETWEEN))
 
