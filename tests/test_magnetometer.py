@@ -10,7 +10,7 @@ from magnetic_motion import PERFECT, turned
 from scipy.spatial.transform import Rotation
 
 from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetometer, compensate, load_calibration
-from jaximu.calibration.magnetometer import field_advice
+from jaximu.calibration.magnetometer import field_advice, hard_iron
 from jaximu.cli import main
 from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
 from jaximu.estimation.fitting import Prior, informed
@@ -19,7 +19,7 @@ from jaximu.mistakes import prepare
 from jaximu.model.effects import CATALOGUE
 from jaximu.recordings import write_recording
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.report.magnetometer import next_words
+from jaximu.report.magnetometer import next_words, statements
 
 FULL = "mpu6050_hmc5883l/full_sphere"
 
@@ -69,6 +69,20 @@ def test_dip_and_heading(cases, calibrations):
         assert abs(dip["value"] - np.degrees(case.dip)) < 4 * dip["sigma"] + 0.1
         assert found.magnetic["heading_error"]["rms"] < 0.5 < found.magnetic["heading_error"]["before"]["rms"]
         assert heading.sigma.shape == heading.before.shape == (6, 24)
+
+
+def test_the_size_of_the_hard_iron_scatters_as_drawn_calibrations(calibrations):
+    found, rng = calibrations[0][0], np.random.default_rng(0)
+    rows = [k for k, name in enumerate(found.names) if name.owner == "magnetometer"]
+    sizes = []
+    for change in rng.multivariate_normal(np.zeros(len(rows)), found.covariance[np.ix_(rows, rows)], 2000):
+        gain, bias = found.imu.magnetometer.gain.copy(), found.imu.magnetometer.bias.copy()
+        for row, value in zip(rows, change, strict=True):
+            (gain if found.names[row].part == "gain" else bias)[found.names[row].axes] += value
+        sizes.append(np.linalg.norm(np.linalg.solve(gain, bias)))
+    iron, sigma = hard_iron(found)
+    assert iron == pytest.approx(np.mean(sizes), abs=0.2 * sigma) and sigma == pytest.approx(np.std(sizes), rel=0.1)
+    assert f"± {1.96 * sigma:.2g} µT (95 %)" in "".join(line.text for line in statements(found))
 
 
 def test_heading_errors_are_those_of_drawn_calibrations(cases, calibrations):
@@ -170,6 +184,25 @@ def test_a_disturbed_stretch_is_left_out_and_told():
     assert left.min() > 18.5 and left.max() < 25.5 and len(left) >= 5
     assert any("disturbed" in note for note in found.notes)
     assert np.abs(off(found, case)).max() < 4.5
+
+
+def test_a_field_that_was_another_for_much_of_the_recording_is_reported():
+    case = turned(3)
+    signal, near = case.magnetometer, (case.magnetometer.time % 20.0 < 9.0)[:, None]
+    values = np.where(near, case.bias + 0.7 * (signal.values - case.bias), signal.values)
+    found, _, _ = fitted(case._replace(magnetometer=replace(signal, values=values)), recording=False)
+    assert any("not the same throughout" in note for note in found.notes)
+
+
+def test_a_shaken_vertical_is_no_disturbed_field(cases):
+    """Pulled sideways by a fifth of gravity the force keeps its size, but leaves the vertical by 11°."""
+    recording, time = cases[0].recording, cases[0].recording.accelerometer.time
+    force = recording.accelerometer.values
+    across = np.cross(force, [0.0, 0.0, 1.0]) * np.sin(9.0 * time)[:, None]
+    pulled = np.where(time % 20 > 17, 0.2, 0.0)[:, None] * across
+    shaken = replace(recording, accelerometer=replace(recording.accelerometer, values=force + pulled))
+    found, _, _ = fitted(cases[0]._replace(recording=shaken))
+    assert not found.magnetic["disturbed"] and not any("disturbed" in note for note in found.notes)
 
 
 def test_a_disturbance_across_the_field_hides_neither_itself_nor_the_hard_iron():

@@ -821,6 +821,15 @@ def _heading_slopes(
     return body, np.einsum("ni,nik->nk", east, _reactions(names, body, triad.gain))
 
 
+def hard_iron(calibration: Calibration) -> tuple[float, float]:
+    """Return the size of the hard iron, µT, and its standard deviation, to first order."""
+    gain, bias = _magnetometer(calibration.imu).gain, _magnetometer(calibration.imu).bias
+    iron = np.linalg.solve(gain, bias)
+    known = calibration.of_numbers(_of_iron)
+    slope = unit_vectors(iron) @ _reactions(known.names, -iron[None], gain)[0]
+    return float(np.linalg.norm(iron)), float(root_or_zero(slope @ known.covariance @ slope))
+
+
 def _reactions(names: Sequence[Name], field: FloatArray, gain: FloatArray) -> FloatArray:
     """How an output, turned back into a field (n, 3), reacts to gain and bias (n, 3, p), but for the sign."""
     change = np.zeros((len(field), 3, len(names)))

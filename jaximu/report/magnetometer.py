@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration import Calibration
+from jaximu.calibration.magnetometer import hard_iron
 from jaximu.ground.document import Json
 from jaximu.ground.page import Page, Picture, Statement
 from jaximu.ground.quantities import Z95, number, sentence
@@ -60,7 +61,7 @@ def statements(calibration: Calibration) -> Iterator[Statement]:
     strength, dip = facts["field"]["strength"], facts["field"]["dip"]
     # a field's image is an ellipsoid; how far from round it is, is soft iron and scale
     axes = np.linalg.svd(gain, compute_uv=False)
-    iron = float(np.linalg.norm(np.linalg.solve(gain, np.asarray(triad.bias))))
+    iron, sigma = hard_iron(calibration)
     text = f"{number(strength['value'], 3)} ± {number(Z95 * strength['sigma'], 2)} µT"
     if dip is not None:
         way = "below" if dip["value"] > 0 else "above"
@@ -70,7 +71,11 @@ def statements(calibration: Calibration) -> Iterator[Statement]:
         known += "; every gain shares the uncertainty of the strength, which --field or --longitude would narrow"
     yield from [
         Statement("The field", f"{text}{known}."),
-        Statement("Hard iron", f"{number(iron, 3)} µT, {number(100 * iron / strength['value'], 2)} % of the field."),
+        Statement(
+            "Hard iron",
+            f"{number(iron, 3)} ± {number(Z95 * sigma, 2)} µT (95 %), {number(100 * iron / strength['value'], 2)} % of "
+            "the field.",
+        ),
         Statement(
             "Soft iron and scale",
             f"The output changes {number(100 * (axes[0] / axes[-1] - 1), 2)} % more with a field along one direction "
