@@ -28,6 +28,7 @@ from jaximu.estimation.fitting import fit
 from jaximu.estimation.problem import flatten, names_of, without_equipment
 from jaximu.fleets import FleetUnit, Job, Settings, find_jobs, fit_units, rows_of, run_fleet
 from jaximu.fleets import engines as engines_module
+from jaximu.fleets.population import read_fleet
 from jaximu.fleets.store import Store
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
@@ -101,6 +102,24 @@ def test_one_row_a_recording_and_the_truth_in_it(table, truths):
     assert len(z2) == 21 * UNITS
     # χ² of as many degrees: independent between units, correlated within one by at most its 21
     assert z2.mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 * 21 / len(z2)))
+
+
+def test_numbers_that_a_recording_leaves_open_are_reported(tmp_path):
+    """Without the rows between its rests a recording shows no gain of the gyroscope."""
+    recording, _ = simulate(draw_imu(0), HandHeld(12, 1.5), consumer_noise(), seed=0)
+    rate = recording.gyroscope.values
+    turning = np.linalg.norm(rate - np.median(rate, axis=0), axis=1) > 0.1
+    kept = np.convolve(turning, np.ones(9), "same") < 1
+    cut = {
+        name: replace(signal, time=signal.time[kept], values=signal.values[kept])
+        for name, signal in recording.signals.items()
+    }
+    write_recording(replace(recording, **cut), tmp_path / "cut.parquet")
+    run_fleet([Job("unit", str(tmp_path / "cut.parquet"))], tmp_path / "fleet.parquet", workers=1)
+    row = pq.read_table(tmp_path / "fleet.parquet").to_pylist()[0]
+    assert row["gyro_gain_sigma"] == [None] * 9 and None not in row["accel_gain_sigma"]
+    assert "does not determine all of gyroscope gain: numbers whose sigma is empty" in row["message"]
+    assert any("1 calibrated unit: see column message" in note for note in read_fleet(tmp_path / "fleet.parquet").notes)
 
 
 def test_schema_is_the_fixed_surface(table):

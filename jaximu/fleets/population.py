@@ -29,6 +29,7 @@ from jaximu.ground.distributions import robust_sigma
 from jaximu.ground.document import Document, Json, entries
 from jaximu.ground.errors import FilePath, NotPossibleError
 from jaximu.ground.page import Result
+from jaximu.ground.quantities import counted
 from jaximu.ground.vectors import root_or_zero, sigmas_of, variances_of
 from jaximu.mistakes.titles import effect_title
 
@@ -304,7 +305,7 @@ def read_fleet(table: FilePath) -> Fleet:
     statuses, verdicts, effects = Counter(), Counter(), Counter()
     failed: dict[str, list[str]] = {}
     reasons: dict[str, str] = {}
-    kinds = Counter()  # with a gyroscope, or without
+    kinds, remarked = Counter(), 0  # with a gyroscope, or without
     with pq.ParquetFile(path) as file:
         for batch in file.iter_batches(batch_size=4096, columns=_SUMMED):
             for row in batch.to_pylist():
@@ -314,6 +315,7 @@ def read_fleet(table: FilePath) -> Fleet:
                 effects.update(row["effects"] or ())
                 if row["status"] == "ok":
                     kinds[row["gyro_unit"] is not None] += 1
+                    remarked += row["message"] is not None
                 else:
                     reason = (row["message"] or "").removeprefix(f"{row['file']}: ")
                     alike = reasons.setdefault(re.sub(r"\d+", "0", reason), reason)
@@ -323,6 +325,8 @@ def read_fleet(table: FilePath) -> Fleet:
     notes = []
     if others:
         notes.append(f"{others} units {'without' if gyroscope else 'with'} a gyroscope are not part of the population.")
+    if remarked:
+        notes.append(f"{counted(remarked, 'calibrated unit')}: see column message for what was not determined.")
     step = max(1, -(-total // _MOST))
     kept = list(islice(chain.from_iterable(_groups(path, gyroscope)), 0, None, step))
     if step > 1:

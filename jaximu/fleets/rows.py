@@ -18,13 +18,14 @@ from jaximu.data.poses import EXCESS_NAMES
 from jaximu.estimation.fitting import Fit
 from jaximu.estimation.problem import flatten, names_of, without_equipment
 from jaximu.estimation.solver import Failure
-from jaximu.estimation.uncertainty import gains_open, weak_directions
+from jaximu.estimation.uncertainty import gains_open, open_numbers, weak_directions
 from jaximu.fleets.field import FieldUnit, field_row, field_unit
 from jaximu.fleets.fit import FleetUnit, fit_units
 from jaximu.fleets.jobs import Job, Settings
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import Json
 from jaximu.ground.errors import FilePath, InputError, JaximuError, NotPossibleError
+from jaximu.ground.quantities import listed
 from jaximu.ground.units import SENSORS
 from jaximu.mistakes import prepared
 from jaximu.model.noise_model import NoiseModel
@@ -44,6 +45,10 @@ COLUMN_PLACES = {
 }
 """Which of `PARAMETERS` a column of the table holds."""
 _TRIANGLE = np.tril_indices(len(PARAMETERS))
+_OPEN = (
+    "the recording does not determine all of {}: numbers whose sigma is empty say nothing. Column weak says what to "
+    "record."
+)
 _EPOCH = 946684800.0  # s; the year 2000: a logger's start before it is no date
 
 
@@ -81,7 +86,8 @@ SCHEMA = pa.schema(
     metadata={
         "jaximu": "jaximu.fleet/1",
         "equation": "y = gain·u + bias (+ effects); gains row-major, in output units per SI unit, biases in output "
-        "units; sigmas with gravity's uncertainty, covariance (lower triangle, row by row, of gain and bias of the "
+        "units; sigmas with gravity's uncertainty, null where the recording does not determine a number, covariance "
+        "(lower triangle, row by row, of gain and bias of the "
         "accelerometer, then of the gyroscope) without; nominal: three scales, three offsets; "
         "a magnetometer's gain (output units per µT, lower triangle) is in its own axes, which `jaximu magnetometer` "
         "finds against the accelerometer's",
@@ -270,9 +276,13 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> Js
     }
     if unit.gyroscope and row["turns"]:
         row["gyro_rms"] = float(rms[1])
-    values = flatten(fit.imu)
+    left = [name in open_numbers(weak) for name in PARAMETERS]
+    values, known = flatten(fit.imu), np.ma.masked_array(sigma, left).tolist()
     for name, part in list(COLUMN_PLACES.items())[: 2 + 2 * unit.gyroscope]:
-        row[name], row[f"{name}_sigma"] = values[part], sigma[part]
+        row[name], row[f"{name}_sigma"] = values[part], known[part]
+    if any(left):
+        parts = listed(list(dict.fromkeys(f"{PARAMETERS[k].owner} {PARAMETERS[k].part}" for k in np.flatnonzero(left))))
+        row["message"] = "; ".join(filter(None, [row["message"], _OPEN.format(parts)]))
     return row
 
 
