@@ -252,7 +252,7 @@ def test_not_a_log(content, tmp_path, capsys):
 def test_missing_files_and_options(log, calibration, tmp_path, capsys):
     assert "nowhere.csv" in refused(capsys, 2, "calibrate", "nowhere.csv")
     assert "LOG is missing" in refused(capsys, 2, "calibrate")
-    assert "--gravity" in refused(capsys, 2, "calibrate", str(log), "--gravity", "9.8", "--latitude", "45")
+    assert "latitude" in refused(capsys, 2, "calibrate", str(log), "--gravity", "9.8", "--latitude", "450")
     assert "--latitude" in refused(capsys, 2, "calibrate", str(log), "--height", "100")
     assert "98" in refused(capsys, 2, "calibrate", str(log), "--gravity", "98")
     (tmp_path / "file").write_text("")

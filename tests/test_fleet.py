@@ -262,6 +262,7 @@ def test_folders_patterns_and_names(folder, tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "log.csv").write_text("x")
+        (tmp_path / name / "README.txt").write_text("Recorded at the bench.\nThe unit lay on foam.\n")
     assert [job.device for job in find_jobs([tmp_path])] == ["a/log", "b/log"]
     output = tmp_path / "a" / "fleet.parquet"
     output.write_text("an older table")

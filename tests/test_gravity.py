@@ -2,6 +2,7 @@
 
 import pytest
 
+from jaximu.cli.options import GravityOptions
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, LocalGravity, parse_gravity, wgs84_gravity
 
@@ -51,3 +52,8 @@ def test_wgs84_falls_with_height():
 def test_wgs84_range(latitude, height):
     with pytest.raises(InputError, match=r"latitude|height"):
         wgs84_gravity(latitude, height)
+
+
+def test_a_stated_gravity_keeps_the_latitude_for_the_rotation_of_the_earth():
+    assert GravityOptions("9.8105+-0.0002", 48.1).value() == LocalGravity(9.8105, 0.0002, 48.1)
+    assert GravityOptions(None, 48.1, 500.0).value() == wgs84_gravity(48.1, 500.0)

@@ -266,20 +266,18 @@ class GravityOptions:
             "known to half a unit of its last digit. Default: standard gravity, known to 0.015 m/s².",
         ),
     ] = None
-    latitude: Annotated[float | None, option("DEG", "Latitude, for gravity (WGS-84) and the Earth's rotation.")] = None
+    latitude: Annotated[
+        float | None,
+        option("DEG", "Latitude, for gravity (WGS-84; with --gravity that one) and the Earth's rotation."),
+    ] = None
     height: Annotated[float, option("M", "Height above sea level, with --latitude.")] = 0.0
 
     def value(self) -> LocalGravity:
         """Return the gravity that was asked for."""
-        if self.gravity is not None and self.latitude is not None:
-            raise InputError("give either --gravity or --latitude, not both.")
-        if self.gravity is not None:
-            return parse_gravity(self.gravity)
-        if self.latitude is not None:
-            return wgs84_gravity(self.latitude, self.height)
-        if self.height:
+        if self.latitude is None and self.height:
             raise InputError("--height needs --latitude.")
-        return STANDARD
+        normal = STANDARD if self.latitude is None else wgs84_gravity(self.latitude, self.height)
+        return normal if self.gravity is None else replace(parse_gravity(self.gravity), latitude=normal.latitude)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Recordings of several files: the folder or ZIP archive in which a phone's app writes one file a sensor."""
 
+import os
 import re
 import shlex
 import tempfile
@@ -54,8 +55,11 @@ _PACKED = set(".zip .gz .bz2 .xz .7z .rar .tar .tgz".split())
 
 
 def is_log(path: Path) -> bool:
-    """Whether a file may be a log, which what commands write beside one is not."""
-    return path.is_file() and not path.name.endswith(_BESIDE)
+    """Whether a file may be a log, which what commands write beside one is not, nor a page of text."""
+    if not path.is_file() or path.name.endswith(_BESIDE):
+        return False
+    text = path.suffix.lower() == ".txt" and os.access(path, os.R_OK)
+    return not (text and _prose(path.name, lambda _: path.open("rb")))
 
 
 def logs_below(folder: Path) -> list[Path]:
