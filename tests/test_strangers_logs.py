@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaximu import InputError, NotPossibleError, calibrate, check
 from jaximu.calibration.arrangement import axes_unlike
@@ -213,6 +214,22 @@ def test_a_wrong_scale_is_named_by_the_angles_from_rest_to_rest(factor, size):
     recording = replace(recording, gyroscope=replace(gyroscope, values=gyroscope.values * factor))
     with pytest.raises(InputError, match=r"reads [\d.]+ times the (angles|rate)"):
         calibrate(recording)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_free_motion_without_a_rest_is_of_one_device(seed):
+    """Moved about by 5 m/s² while it turns: the calmest stretches are no rests."""
+    random, time = np.random.default_rng(seed), np.arange(0.0, 120.0, 0.01)
+
+    def sway(fastest):
+        waves = 2 * np.pi * random.uniform(0.1, 1.0, (3, 5)) * fastest * time[:, None, None]
+        return np.sin(waves + random.uniform(0, 2 * np.pi, (3, 5))).sum(axis=2)
+
+    attitude = Rotation.from_euler("ZYX", sway(0.25) * [0.7, 0.35, 0.7])
+    rate = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / 0.01
+    force = attitude.inv().apply(3.0 * sway(1.0) + [0.0, 0.0, 9.81]) + 0.01 * random.normal(size=(len(time), 3))
+    recording = Recording(Signal(time, force, "m/s^2"), Signal(time, np.vstack([rate, rate[-1:]]), "rad/s"))
+    assert "data.mixed_devices" not in names_of(recording)
 
 
 def test_the_gyroscope_of_another_recording_is_of_another_device():

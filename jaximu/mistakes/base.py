@@ -251,9 +251,18 @@ class Samples:
 
     @cached_property
     def rests(self) -> FloatArray:
-        """(k, 2) start and stop, s, of the stretches in which the accelerometer rests, and the gyroscope if it can."""
+        """(k, 2) start and stop, s, of the stretches in which the accelerometer rests, and the gyroscope if it can.
+
+        The calmest stretches of free motion are no rests: the force turns in them.
+        """
         sensor = self.accelerometer
-        return np.zeros((0, 2)) if sensor is None else spans_of(sensor.quiet, sensor.time, _SHORTEST_REST)
+        spans = np.zeros((0, 2)) if sensor is None else spans_of(sensor.quiet, sensor.time, _SHORTEST_REST)
+        if sensor is None or not len(spans):
+            return spans
+        first, last = np.searchsorted(sensor.time, spans).T
+        middle = (first + last) // 2
+        halves = [of_each(np.median, sensor.values, np.stack(ends, 1)) for ends in ((first, middle), (middle, last))]
+        return spans[lengths_of(halves[1] - halves[0]) < np.sin(TURN_ANGLE / 2) / 2 * lengths_of(halves[0])]
 
     @cached_property
     def rested(self) -> bool:
