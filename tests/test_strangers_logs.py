@@ -216,6 +216,19 @@ def test_a_wrong_scale_is_named_by_the_angles_from_rest_to_rest(factor, size):
         calibrate(recording)
 
 
+@pytest.mark.parametrize(("style", "delimiter"), [(",.", ","), (",.", ";"), (".,", ";"), (".,", "\t")])
+def test_signs_that_group_thousands_are_no_decimal_signs(style, delimiter, tmp_path):
+    rows = columns(by_hand()) * [1e3, *3 * [1e3 / 9.80665], *3 * [1e3]]
+    names = ["time [ms]", "ax [mg]", "ay [mg]", "az [mg]", "gx [mrad/s]", "gy [mrad/s]", "gz [mrad/s]"]
+    texts = [[f"{value:,.1f}".translate(str.maketrans(",.", style)) for value in row] for row in rows]
+    quote = '"' if delimiter == "," else ""
+    written = [delimiter.join(f"{quote}{cell}{quote}" for cell in row) for row in [names, *texts]]
+    log = save(tmp_path / "log.csv", *written)
+    read = read_recording(log)
+    np.testing.assert_allclose(read.accelerometer.si(), rows[:, 1:4] * 9.80665e-3, atol=1e-3)
+    np.testing.assert_allclose(read.gyroscope.si(), rows[:, 4:] / 1e3, atol=1e-4)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_free_motion_without_a_rest_is_of_one_device(seed):
     """Moved about by 5 m/s² while it turns: the calmest stretches are no rests."""

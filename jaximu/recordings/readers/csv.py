@@ -5,7 +5,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import accumulate, pairwise
 from os import SEEK_END
@@ -58,6 +58,9 @@ def read(path: Path, source: Source) -> LogTable:
             "holds binary data of no known format; expected CSV, TSV, blank-separated text, Parquet, NPZ or MAT."
         )
     layout = _layout(_lines(head), source.path)
+    if grouping := _grouping(_lines(head), layout):
+        layout = replace(layout, decimal=".,".replace(grouping, ""))
+        whole = _ungrouped(_lines(path.read_bytes() if whole is None else whole), layout, grouping.encode())
     rows: np.ndarray | int = layout.first + 1
     remarks: tuple[str, ...] = ()
     parsed = _read_straight(path, layout) if whole is None and layout.delimiter != " " else None
@@ -126,6 +129,34 @@ def _lines(data: bytes) -> bytes:
     """Text without a byte order mark, its lines ended by line feeds."""
     data = data.removeprefix(b"\xef\xbb\xbf")
     return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in data else data
+
+
+def _grouping(head: bytes, layout: _Layout) -> str:
+    """The sign that groups thousands, as in "1,234.5" or 1.234,5; "" where none does.
+
+    Every cell that holds it is grouped so, and the same column has numbers without it.
+    """
+    text = _text(b"\n".join(head.split(b"\n")[layout.first : -1]))
+    if layout.delimiter == "," and '"' not in text:
+        return ""
+    for sign, decimal in (",.", ".,"):
+        if sign in text and (sign == "," or decimal in text):
+            grouped = re.compile(rf"\s*[-+]?[1-9]\d{{0,2}}(\{sign}\d{{3}})+(\{decimal}\d+)?\s*")
+            rows = [_cells(line, layout.delimiter) for line in text.split("\n")]
+            holding = [[cell for cell in column if sign in cell] for column in zip(*rows, strict=False)]
+            mixed = any(0 < len(cells) < len(rows) for cells in holding)
+            if mixed and all(grouped.fullmatch(cell) for cells in holding for cell in cells):
+                return sign
+    return ""
+
+
+def _ungrouped(data: bytes, layout: _Layout, sign: bytes) -> bytes:
+    """The text without the sign that groups thousands in its rows of data."""
+    above = data.split(b"\n", layout.first)
+    below = above.pop()
+    if layout.delimiter.encode() == sign:
+        return b"\n".join([*above, re.sub(rb'"[^"\n]*"', lambda cell: cell[0].replace(sign, b""), below)])
+    return b"\n".join([*above, below.replace(sign, b"")])
 
 
 def _read_straight(path: Path, layout: _Layout) -> tuple[list[np.ndarray], pa.Schema] | None:
