@@ -400,6 +400,13 @@ def test_a_magnetometer_without_a_unit_is_left_out(phone, tmp_path):
     assert recording.magnetometer is not None and recording.magnetometer.unit == "uT"
 
 
+def test_files_of_a_folder_without_units_are_named_with_the_command_that_asks(tmp_path):
+    for sensor in ("Accelerometer", "Gyroscope"):
+        (tmp_path / f"{sensor}.csv").write_text("t,x,y,z\n1,2,3,4\n2,3,4,5\n3,4,5,7\n")
+    with pytest.raises(InputError, match=r"jaximu info \S+Accelerometer\.csv --gyro-log \S+Gyroscope\.csv"):
+        read_recording(tmp_path)
+
+
 PROSE = (
     "IMU log of 4 March 2026, session 1, 14:05.\n\nSampled at 100 Hz: 3 axes, 16 bits, range 4 g.\nRecorded by hand.\n"
 )

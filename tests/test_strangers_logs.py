@@ -229,6 +229,20 @@ def test_signs_that_group_thousands_are_no_decimal_signs(style, delimiter, tmp_p
     np.testing.assert_allclose(read.gyroscope.si(), rows[:, 4:] / 1e3, atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("header", "cell", "words"),
+    [
+        ("time,", "T+{}h,", "Column 'time' holds 'T+0h': this was not understood as time"),
+        ("time,", "5,", "Column 'time' does not rise: this was not understood as time"),
+        ("", "", "The file has no time column"),
+    ],
+)
+def test_a_time_column_that_is_not_understood_is_named(header, cell, words, tmp_path):
+    rows = [cell.format(at) + line for at, line in enumerate(lines(columns(by_hand())[:, 1:]))]
+    (question,) = advise_reading(save(tmp_path / "log.csv", header + HEAD, *rows)).questions
+    assert words in question.text
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_free_motion_without_a_rest_is_of_one_device(seed):
     """Moved about by 5 m/s² while it turns: the calmest stretches are no rests."""

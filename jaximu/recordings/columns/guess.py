@@ -314,6 +314,14 @@ class _Guess:
             return at
         return None
 
+    def _without_time(self) -> str:
+        """Why there are no stamps: no column has a name of time, or one has, and holds something else."""
+        for at, field, values in self._looked_at():
+            if field.sensor == TIME or {"time", "date", "timestamp"} & set(field.stem):
+                held = "does not rise" if values is not None else f"holds {str(self.table.columns[at][0])[:30]!r}"
+                return f"Column {self.table.label(at)} {held}: this was not understood as time, and no rate is stated."
+        return "The file has no time column and states no rate."
+
     def _carry_on(self) -> None:
         """Let the time go on where a counter starts again, whatever its end is."""
         values = None if self.time is None else self.numbers[self.time]
@@ -495,7 +503,10 @@ class _Guess:
             shown = " or ".join(f"{triad.label} (norm {triad.level:.4g})" for triad in candidates[:4])
             self._ask(f"Which columns are the accelerometer? {shown} could be, or could be a magnetometer.")
         else:
-            self._ask("Which columns are the accelerometer? No three unnamed columns hold 1 g at rest.")
+            self._ask(
+                "Which columns are the accelerometer? None are named so, and no three others hold 1 g while the unit "
+                "rests."
+            )
         return None
 
     def _by_turning(self, free: list[_Triad], accel: _Triad) -> _Triad | None:
@@ -605,12 +616,7 @@ class _Guess:
             slope = self._time_unit(self.time, gyro, slope)
         elif not self.table.rate:
             self.rate = "?"
-            self._ask(
-                "How many samples a second (--rate)? The file has no time column and states no rate.",
-                "?",
-                _USUAL_RATE,
-                "rate",
-            )
+            self._ask(f"How many samples a second (--rate)? {self._without_time()}", "?", _USUAL_RATE, "rate")
         if gyro is not None:
             known = self.time is not None or self.table.rate is not None
             self._gyro_unit(gyro, accel, slope if known else None, None if known else slope)

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import re
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -457,7 +458,11 @@ def _of_sensors(tables: Mapping[str, LogTable]) -> list[LogTable]:
             whole.append(of_sensor(table, sensor))
         except InputError as error:
             if not whole:
-                raise
+                files = " --gyro-log ".join(shlex.quote(tables[key].path) for key in ("accel", "gyro") if key in tables)
+                raise InputError(
+                    f"{error.args[0]} Give its files themselves, unpacked; then units can be stated, and a guess of "
+                    f"them is made: jaximu info {files}"
+                ) from None
             notes.append(f"not used: {error.args[0]}")
     return [whole[0].noted(*notes), *whole[1:]]
 
