@@ -207,6 +207,13 @@ def test_npz_triads_and_rate(tmp_path):
     np.testing.assert_allclose(recording.gyroscope.values, np.radians(values[:, 3:]))
 
 
+def test_an_array_of_another_length_is_not_left_out_in_silence(tmp_path):
+    values = samples()
+    np.savez(tmp_path / "log.npz", **{"acc [g]": values[:, :3] / 9.8, "gyr [dps]": values[::2, 3:], "fs": 200.0})
+    notes = read_recording(tmp_path / "log.npz").notes
+    assert any(f"'gyr' has {len(values[::2])} rows where others have {len(values)}" in note for note in notes)
+
+
 def test_mat_struct_and_units(tmp_path):
     values = samples()
     log = {"imu": {"acc": values[:, :3], "gyr": values[:, 3:]}, "t": np.arange(8.0)[None, :] * 10, "other": np.eye(3)}

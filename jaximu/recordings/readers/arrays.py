@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.ground.units import column_title, parse_column
+from jaximu.ground.quantities import listed
+from jaximu.ground.units import SENSORS, column_title, parse_column
+from jaximu.recordings.columns.habits import sensor_of, words_of
 from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.recording import Source
 
@@ -44,19 +46,24 @@ def table_of(variables: Mapping[str, Any], source: Source) -> LogTable:
     rows = sizes.most_common(1)[0][0]
     names = []
     columns = []
+    unused = []
     for name, array in arrays:
         array = array.reshape(-1, 1) if array.ndim == 1 or 1 in array.shape else array
         array = array.T if array.shape[0] != rows and array.shape[-1] == rows else array
-        if array.shape[0] != rows or array.shape[1] > _WIDEST:
-            continue
         base, unit = parse_column(name)
+        if array.shape[0] != rows or array.shape[1] > _WIDEST:
+            if 3 in array.shape and sensor_of(tuple(words_of(base)))[0] in SENSORS:
+                unused.append(f"{base!r} has {max(array.shape)}")
+            continue
         unit = unit or stated.get(base)
         count = array.shape[1]
         axes = _AXES.get(count, tuple(map(str, range(count))))
         for axis, column in zip(axes, array.T, strict=True):
             names.append(column_title(base if count == 1 else f"{base}_{axis}", unit))
             columns.append(np.ascontiguousarray(column, np.float64 if column.dtype.kind == "f" else np.int64))
-    return LogTable(source, tuple(names), tuple(columns), rate=rate)
+    table = LogTable(source, tuple(names), tuple(columns), rate=rate)
+    advice = "A gyroscope with a clock of its own needs a file of its own: --gyro-log."
+    return table.noted(f"not used: {listed(unused)} rows where others have {rows}. {advice}") if unused else table
 
 
 def _opened(variables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
