@@ -62,7 +62,7 @@ def table_of(variables: Mapping[str, Any], source: Source) -> LogTable:
             names.append(column_title(base if count == 1 else f"{base}_{axis}", unit))
             columns.append(np.ascontiguousarray(column, np.float64 if column.dtype.kind == "f" else np.int64))
     table = LogTable(source, tuple(names), tuple(columns), rate=rate)
-    advice = "A gyroscope with a clock of its own needs a file of its own: --gyro-log."
+    advice = "A gyroscope with its own clock needs a separate file: --gyro-log."
     return table.noted(f"not used: {listed(unused)} rows where others have {rows}. {advice}") if unused else table
 
 
