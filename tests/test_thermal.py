@@ -483,7 +483,7 @@ def test_the_measured_leg(leg):
     assert any("first row is a start-up transient" in note for note in found.notes)
     words = " ".join(found.identifiability.words)
     assert "cannot separate the rate of temperature, a lag or a hysteresis" in words and "cycle" in words
-    assert any("gyroscope's output jumps" in note and "(x)" in note for note in found.notes)  # it was kept apart from temperature
+    assert any("gyroscope's output jumps" in note and "(x)" in note for note in found.notes)
     for fit in found.fits.values():
         assert np.all(np.std(fit.residual, axis=0) < 0.33 * fit.before)  # every axis; 0.07 to 0.3
         assert fit.candidate.family != "constant"
