@@ -150,7 +150,8 @@ class Recorded(eqx.Module):
 
     def in_session(self, start: float) -> Recorded:
         """Return the same of a recording whose clock was at zero so many seconds after a session began."""
-        return replace(self, known={name: replace(of, session_time=start + of.time) for name, of in self.known.items()})
+        known = {name: replace(of, session_time=start + self.stamps(name)) for name, of in self.known.items()}
+        return replace(self, known=known)
 
     def asked_for_vibration(self, stands_out: bool = False) -> Recorded:
         """Return the same with vibration among what the unit went through, zero unless it stands out."""

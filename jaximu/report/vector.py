@@ -146,6 +146,6 @@ def _axis(axis: Axis, labels: Sequence[str], ends: tuple[float, float]) -> Json:
     if isinstance(locator, FixedLocator) or type(locator).__name__ == "StrCategoryLocator":
         places = locator()
         texts = axis.get_major_formatter().format_ticks(list(places))
-        if (places == np.arange(len(places))).all() and not any(map(str.isdecimal, texts)):
+        if np.array_equal(places, np.arange(len(places))) and not any(map(str.isdecimal, texts)):
             attributes["names"] = [name.replace("\n", " ") for name in texts]
     return attributes
