@@ -14,7 +14,6 @@ from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.ground.gravity import STANDARD
 from jaximu.ground.quantities import Z95, listed, sentence, with_interval
-from jaximu.ground.vectors import lengths_of
 
 if TYPE_CHECKING:
     from jaximu.ground.array_types import BoolArray, FloatArray
@@ -228,6 +227,7 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
     """
     import numpy as np
 
+    from jaximu.ground.vectors import lengths_of
     from jaximu.recordings.recording import plausibility
 
     signals, poses = recording.signals, 0
@@ -277,6 +277,7 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
 
 def _at_rest(recording: Recording, repaired: Recording, findings: list[str]) -> tuple[float, float, float, float]:
     """Seconds of a recording, those at rest in all and at a stretch, and when that begins; said among `findings`."""
+    from jaximu.ground.vectors import lengths_of
     from jaximu.recordings.recording import runs_of
     from jaximu.report.recording import signal_facts
 
@@ -384,6 +385,7 @@ def _still_seconds(recording: Recording) -> tuple[float, BoolArray, FloatArray]:
     """
     import numpy as np
 
+    from jaximu.ground.vectors import lengths_of
     from jaximu.recordings.segmentation import Moments
 
     sensors = [(signal, _STILL[name][0]) for name, signal in recording.signals.items() if name in _STILL]
