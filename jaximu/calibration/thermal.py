@@ -53,7 +53,7 @@ THERMAL = (*POWERS, *RATES, *HISTORY, *BESIDE, LEARNED, NETWORK, SCALE)
 _GRID = 41
 _LONG = 1e6  # s that a steady way has lasted
 _BESIDE, _FEWEST = 4, 40  # blocks on each side of a jump; edges from which on jumps are sought
-_JUMP, _WITH_IT = 10.0, 5.0  # times the standard deviation of such changes: of a jump, and of another axis beside it
+_JUMP = 10.0  # times the standard deviation of such changes; another axis beside it jumps from half as much on
 _SHARP = 0.75  # share of the change that two blocks must see of it
 _MOST_JUMPS = 8
 _MISFIT = 1.5
@@ -313,7 +313,7 @@ def _told_jumps(blocks: RestBlocks, fits: Mapping[str, TriadFit], jumps: Sequenc
         for block in jumps:
             by_axis = change[np.searchsorted(edges, block)]
             times = np.abs(by_axis) / usual
-            axes = np.flatnonzero(times > _WITH_IT)
+            axes = np.flatnonzero(times > _JUMP / 2)
             if len(axes):
                 by = [f"{size(float(by_axis[axis]), SENSOR_UNITS[name], 2)} ({'xyz'[axis]})" for axis in axes]
                 notes.append(
