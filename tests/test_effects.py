@@ -366,4 +366,4 @@ def test_setup_effects_act_one_after_the_other():
 
 def test_stimulus_says_what_its_fields_are():
     arrays = {field.name for field in dataclasses.fields(Stimulus) if not field.metadata.get("static")}
-    assert arrays == {*FIELDS, "memory"}
+    assert arrays == {*FIELDS, "memory", "session_time"}

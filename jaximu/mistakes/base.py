@@ -262,7 +262,8 @@ class Samples:
         first, last = np.searchsorted(sensor.time, spans).T
         middle = (first + last) // 2
         halves = [of_each(np.median, sensor.values, np.stack(ends, 1)) for ends in ((first, middle), (middle, last))]
-        return spans[lengths_of(halves[1] - halves[0]) < np.sin(TURN_ANGLE / 2) / 2 * lengths_of(halves[0])]
+        turned = np.sin(TURN_ANGLE / 2) / 2 * lengths_of(halves[0])
+        return spans[lengths_of(halves[1] - halves[0]) < np.maximum(turned, sensor.noise.max())]
 
     @cached_property
     def rested(self) -> bool:
