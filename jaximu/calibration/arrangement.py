@@ -48,7 +48,7 @@ def unusual_gains(imu: Imu, weak: Sequence[WeakDirection], scales: Mapping[str, 
     if imu.gyroscope is None or "gyroscope" not in scales:
         return findings
     scale = scales["gyroscope"]
-    read = imu.gyroscope.gain / scale[:, None]  # rates as read = read @ true rates
+    read = np.asarray(imu.gyroscope.gain) / scale[:, None]  # rates as read = read @ true rates
     arranged = signed_permutation(read.T).T
     rest = rotation_of((arranged.T @ read).T).T
     if angle_of(rest) > _BETWEEN and np.linalg.det(read) > 0:
@@ -80,8 +80,8 @@ def axes_unlike(recording: Recording, imu: Imu) -> str:
     motion, gyroscope = recording.turning, recording.gyroscope
     if motion is None or not motion.clear or gyroscope is None or imu.gyroscope is None:
         return ""
-    force = signed_permutation(imu.accelerometer.gain.T).T
-    rates = imu.gyroscope.gain / gyroscope.nominal_scale[:, None]
+    force = signed_permutation(np.asarray(imu.accelerometer.gain).T).T
+    rates = np.asarray(imu.gyroscope.gain) / gyroscope.nominal_scale[:, None]
     arranged = signed_permutation(np.linalg.det(force) * force.T @ motion.matrix @ rates)
     if np.array_equal(arranged, np.eye(3)):
         return ""

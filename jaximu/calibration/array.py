@@ -272,7 +272,7 @@ def _unit(
     turned = Rotation.from_rotvec(mounting.rotation)
     slope, back = np.asarray(right_jacobian(mounting.rotation)), turned.as_matrix()
     errors = {kind.name: kind.error for kind in station_errors(fitted.imu, motion, np.zeros(3))}
-    length = (motion.stop - motion.start)[motion.gyroscope_used]
+    length = np.asarray(motion.stop - motion.start)[np.asarray(motion.gyroscope_used)]
     both = np.concatenate([back @ errors["specific_force"], back @ (np.radians(errors["turn_angle"]) / length)]).T
     rate, force = (rms(both[:, columns]) for columns in (slice(3, 6), slice(3)))
     unit = ArrayUnit(

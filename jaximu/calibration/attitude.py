@@ -211,7 +211,7 @@ def _begin(recording: Recording, start: _Start, effects: Sequence[Effect], unit:
     )
     imu = as_stated(recording) if unit is None else unit.transferable()
     if unit is None and imu.gyroscope is not None:
-        imu = replace(imu, gyroscope=replace(imu.gyroscope, gain=imu.gyroscope.gain @ start.arranged))
+        imu = replace(imu, gyroscope=replace(imu.gyroscope, gain=np.asarray(imu.gyroscope.gain) @ start.arranged))
     by_name = {effect.name: effect for effect in (*setup, *imu.all_effects().values(), *effects)}
     return on_host(imu.with_effects(*by_name.values()))
 

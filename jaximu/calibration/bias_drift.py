@@ -39,7 +39,7 @@ def knowing_drift(
 
 def with_gravity(fitted: Fit, sigmas: Mapping[str, FloatArray], gravity: LocalGravity) -> dict[str, FloatArray]:
     """Return standard deviations (3,) of biases, by triad, with what gravity's uncertainty adds."""
-    shift = fitted.magnitude_sensitivity * gravity.sigma
+    shift = np.asarray(fitted.magnitude_sensitivity) * gravity.sigma
     biases = {
         triad: [k for k, name in enumerate(fitted.names) if name.owner == triad and name.part == "bias"]
         for triad in sigmas

@@ -333,14 +333,14 @@ def concluded(
     beforehand; of these alone nobody asks whether the data tell them. `prior`: what is known of such numbers; it tells
     them as data do. `working`: fields of `Calibration`.
     """
-    jacobian = fitted.jacobian
+    jacobian = np.asarray(fitted.jacobian)
     if prior is not None:
         known = {*known, *prior.names}
         jacobian = np.concatenate([jacobian, prior.rows(fitted.names, fitted.sizes)])
     rank, weak = weak_directions(jacobian, fitted.names, fitted.sizes, fitted.imu, advice)
     weak = tuple(one for one in weak if not set(known).issuperset(name for name, _ in one.parameters))
     before, after = rms
-    excess: dict[str, float] = dict(zip(excess_names, fitted.excess.tolist(), strict=False))
+    excess: dict[str, float] = dict(zip(excess_names, np.asarray(fitted.excess).tolist(), strict=False))
     clock = clock_sigma(working.get("segmentations", ()))
     return Calibration(
         imu=on_host(fitted.imu),

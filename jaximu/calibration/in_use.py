@@ -165,7 +165,7 @@ class FilterInUse:
         self._mounted, self._magnetic = mounted, magnetic
         self._moves = mounted is not None and mounted.attitude.velocities() is not None
         self._pending: deque[tuple[float, float, FloatArray, FloatArray | None]] = deque()
-        self._floor = disturbances(noise).white * rate
+        self._floor = np.asarray(disturbances(noise).white) * rate
         self._count, self._padded, self._rate = round(INTERVAL * rate), int(np.ceil(_SPAN * INTERVAL * rate)), rate
         self._numbers = flatten(self.imu)
         self.begun = self._numbers[self._index]

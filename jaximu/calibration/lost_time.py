@@ -190,10 +190,10 @@ class _Recorded:
         about = condensed(*lifted((fitted.imu.with_effects(), observations)))
         assert about.reaction is not None and about.running is not None
         self.turns: Turns = observations.turns
-        self.force, self.running = about.force[0], about.running
-        self.output, self.interval = self.turns.output, self.turns.interval
+        self.force, self.running = about.force[0], np.asarray(about.running)
+        self.output, self.interval = np.asarray(self.turns.output), np.asarray(self.turns.interval)
         chain = first(about.covariance)
-        self.residual, slope = (rows[chain.used > 0] for rows in unwhitened(fitted, chain))
+        self.residual, slope = (rows[np.asarray(chain.used) > 0] for rows in unwhitened(fitted, chain))
         covariance = chain.dense()
         self.used = covariance.used > 0
         used = np.ix_(self.used, self.used)
@@ -208,7 +208,7 @@ class _Recorded:
         # (T, S, 2): what a sample that is lost takes off its turn
         self.lacking = -np.einsum(
             "tasi,tsi->tsa",
-            about.reaction.turn,
+            np.asarray(about.reaction.turn),
             (self.output - gyroscope.bias) * (self.interval > 0)[..., None],
         )[real]
         missed = missed_by_sampling(self.turns, gyroscope, about.running)[real]
@@ -270,11 +270,11 @@ class _Recorded:
         """
         real = int(self.turned.real[turn])
         after = unit_vectors(self.force[real + 1])
-        before = unit_vectors(after - self.turns.basis[real].T @ off)
+        before = unit_vectors(after - np.asarray(self.turns.basis)[real].T @ off)
         running = self.running[real][: self.counts[turn]]
         back = multiply(conjugate(running), np.broadcast_to(running[-1], running.shape))
         carried, wanted = (
-            rotate(back, np.broadcast_to(gravity, (len(running), 3)))[:-1] for gravity in (before, after)
+            np.asarray(rotate(back, np.broadcast_to(gravity, (len(running), 3))))[:-1] for gravity in (before, after)
         )
         rate = self.gyroscope.recover_on_host(self.output[real][: len(running)])
         middle = midpoints(rate)

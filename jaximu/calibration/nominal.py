@@ -75,7 +75,7 @@ def _forces(recording: Recording) -> FloatArray:
     if not (inverse > 0).all():
         return np.ones(3)
     factors = 1 / np.sqrt(inverse)
-    return np.where(np.abs(np.log(factors)) > _ODD, factors, 1.0)
+    return np.asarray(np.where(np.abs(np.log(factors)) > _ODD, factors, 1.0), np.float64)
 
 
 def _start(motion: Turning) -> FloatArray:
@@ -85,4 +85,4 @@ def _start(motion: Turning) -> FloatArray:
     if angle_of(rotation_of(rest)) > _MOUNTED:
         return motion.matrix
     scales = np.maximum(np.diag(rest), 1e-6)
-    return arranged * np.where(np.abs(np.log(scales)) > _SAME, scales, 1.0)
+    return np.asarray(arranged * np.where(np.abs(np.log(scales)) > _SAME, scales, 1.0), np.float64)

@@ -385,4 +385,4 @@ def _mean_temperature(recordings: Sequence[Recording], observations: Observation
     if any(recording.temperature is None for recording in recordings):
         return {}
     poses = observations.poses
-    return {"temperature": float(np.mean(poses.temperature[poses.mask]))}
+    return {"temperature": float(np.mean(np.asarray(poses.temperature)[np.asarray(poses.mask)]))}

@@ -37,10 +37,10 @@ class Scheme:
 
 def describe_scheme(stations: Stations) -> tuple[Scheme, ...]:
     """Return what the stations determine of the accelerometer and of the gyroscope, 12 parameters each."""
-    weight = stations.weight[..., None]
+    weight = np.asarray(stations.weight)[..., None]
     stimulus = stations.stimulus
     return tuple(
-        _scheme(triad, dot_rows(weight, quantity)[used])
+        _scheme(triad, dot_rows(weight, np.asarray(quantity))[np.asarray(used)])
         for triad, quantity, used in (
             ("accelerometer", stimulus.specific_force, stations.accelerometer_used),
             ("gyroscope", stimulus.angular_rate, stations.gyroscope_used),

@@ -206,9 +206,9 @@ def _turned_as_a_whole(calibration: Calibration) -> list[str]:
 def _at_rest_where_open(fitted: Fit, start: Imu) -> Fit:
     """Return the fit with what the data leave open where the data sheet has it: noise had moved it about."""
     parameters = Parameters.select(start, lambda name: name in fitted.names)
-    values = parameters.reference[list(parameters.index)]
+    values = np.asarray(parameters.reference)[list(parameters.index)]
     moved = (fitted.values - values) / fitted.sizes
-    _, known, right = np.linalg.svd(fitted.jacobian, full_matrices=True)
+    _, known, right = np.linalg.svd(np.asarray(fitted.jacobian), full_matrices=True)
     known = np.pad(known, (0, len(right) - len(known)))
     free = right[1 / np.hypot(known, 1 / TOLERANCE) > UNDETERMINED]
     if not len(free):

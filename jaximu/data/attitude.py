@@ -406,7 +406,7 @@ class AgainstAttitude(OfOneUnit):
         """Return what the unit went through at the gyroscope's samples as it measured it, standing as was measured."""
         known = stimuli(self.recording, imu)["gyroscope"]
         mounting = Mounting.of(imu)
-        stamps = mounting.on_reference(known.time) - self.offset
+        stamps = mounting.on_reference(np.asarray(known.time)) - self.offset
         stood = self.attitude.at(np.clip(stamps, *self.attitude.time[[0, -1]])).as_quat(scalar_first=True)
         return replace(known, attitude=np.asarray(multiply(stood, mounting.turned)))
 
@@ -583,7 +583,7 @@ class AgainstAttitude(OfOneUnit):
             whole[rows.ravel()] = factor
             return (whole.T * used).T
 
-        back = rotation_matrix(conditions.target).swapaxes(1, 2)
+        back = np.asarray(rotation_matrix(conditions.target)).swapaxes(1, 2)
         step = np.sqrt(np.maximum(duration, 0.0))
         walk = np.kron(np.tril(np.ones((turns, turns))) * step * duration[:, None], np.eye(3))
         mean = np.eye(3) / total[:, None, None]

@@ -117,12 +117,12 @@ class RecordedByHand(OfOneUnit):
     def rate_at_rest(self) -> FloatArray:
         """Return the gyroscope's mean output (3,) over the poses."""
         poses = self.observations.poses
-        return poses.gyroscope_mean[poses.mask].mean(axis=0)
+        return np.asarray(poses.gyroscope_mean)[np.asarray(poses.mask)].mean(axis=0)
 
     def rotations(self, imu: Imu) -> FloatArray:
         """Return how the rotation vector of each turn (t, 3, 3, 4), rad, reacts to K⁻¹ and −K⁻¹b of the gyroscope."""
-        slope = self.along(imu, ()).condensed.conditions.slope
-        return slope[0, self.observations.turns.mask]
+        slope = np.asarray(self.along(imu, ()).condensed.conditions.slope)
+        return slope[0, np.asarray(self.observations.turns.mask)]
 
     def with_noise(self, noise: NoiseModel) -> RecordedByHand:
         """Return the poses and turns with the covariance that a noise of the samples makes."""

@@ -67,7 +67,7 @@ def slow_units(known: AxisNoise, shortest: float, duration: float) -> dict[str, 
     longest = np.array([_LONGEST * duration])
 
     def of(times: FloatArray, variance: FloatArray) -> AxisNoise:
-        return AxisNoise(np.zeros(3), np.zeros(3), white * variance, times)
+        return AxisNoise(np.zeros(3), np.zeros(3), white * variance, np.asarray(times, np.float64))
 
     return {
         "bias instability": of(times, np.full(len(times), np.log(RATIO) / np.pi)),
@@ -125,7 +125,7 @@ def with_drift(
     whole, excess = covariance.dense(), np.asarray(fitted.excess)
     used = whole.used > 0
     weighted = submatrix(whole.total(excess), used)
-    total, sizes = np.asarray(fitted.covariance), fitted.sizes
+    total, sizes = np.asarray(fitted.covariance, np.float64), np.asarray(fitted.sizes)
     by_conditions = np.zeros((len(total), len(used)))
     by_conditions[:, used] = -total / sizes @ np.linalg.solve(weighted, jacobian[used]).T
     sentences: tuple[str, ...] = ()
@@ -264,9 +264,9 @@ def means_by_hand(
         for name, rows in zip(TRIADS, mean_output_reactions(reaction), strict=True)
         if name in scales
     }
-    scatter = {name: getattr(poses, f"{name}_covariance")[real] for name in reactions}
+    scatter = {name: np.asarray(getattr(poses, f"{name}_covariance"))[real] for name in reactions}
     variances = {name: variances_of(covariance) for name, covariance in scatter.items()}
-    start, stop = poses.start[real], poses.stop[real]
+    start, stop = np.asarray(poses.start)[real], np.asarray(poses.stop)[real]
     return OutputMeans.of(start, stop, np.repeat(np.arange(len(counts)), counts)[real], reactions, scales, variances)
 
 
@@ -339,7 +339,7 @@ def restricted_likelihood(
         best, log_size, (projector, sizes) = value, log_size + step, there
     parts = sizes[:, None, None] * (projector @ components)
     information = 0.5 * np.einsum("kij,lji->kl", parts, parts) + np.diag(known)
-    return log_size, np.linalg.inv(information)
+    return log_size, np.asarray(np.linalg.inv(information), np.float64)
 
 
 def _projector(covariance: FloatArray, jacobian: FloatArray) -> tuple[FloatArray, float]:

@@ -523,7 +523,7 @@ def first_knowledge(errors: Disturbances, velocity: Float[Array, 3], shared: int
     drift = 1 / np.sqrt(np.ravel(errors.variance))
     root = np.concatenate([_first_root(_LEVEL if turned else _HEADING), drift, np.zeros(shared)])
     right = np.zeros(len(root))
-    right[3:6] = -velocity / _STILL
+    right[3:6] = -np.asarray(velocity) / _STILL
     return Knowledge(np.diag(root), right)
 
 

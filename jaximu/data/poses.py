@@ -479,7 +479,7 @@ def residual_rms(
 
     `known`: forces and angles of the unit, where at hand.
     """
-    poses, turns = observations.poses.mask, observations.turns.mask
+    poses, turns = np.asarray(observations.poses.mask), np.asarray(observations.turns.mask)
     force, angle = forces_and_angles(imu, observations) if known is None else known
     norm = lengths_of(force[poses]) - float(observations.gravity)
     sizes = {"gravity_norm": (rms(norm), "m/s^2")}
@@ -487,7 +487,7 @@ def residual_rms(
         return sizes
     if turns.any():
         sizes["gravity_direction"] = (rms(np.degrees(angle)[turns]), "deg")
-    rest = observations.poses.gyroscope_mean[poses] - imu.gyroscope.bias
+    rest = np.asarray(observations.poses.gyroscope_mean)[poses] - np.asarray(imu.gyroscope.bias)
     sizes["static_gyroscope"] = (rms(lengths_of(rest / imu.gyroscope.scales)), "rad/s")
     return sizes
 

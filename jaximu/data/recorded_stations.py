@@ -217,7 +217,7 @@ def station_means(stations: Stations, recordings: Sequence[Recording]) -> Output
         measured = variances_of(getattr(stations, f"{name}_covariance")).T
         variances[name] = np.where(used[name][kept, None], measured[kept], np.nan)
     reactions = {name: output_reaction(name, unit, used[name]).reshape(-1, len(kept), 3) for name in scales}
-    start, stop, which = (part[kept] for part in (stations.start, stations.stop, stations.recording))
+    start, stop, which = (np.asarray(part)[kept] for part in (stations.start, stations.stop, stations.recording))
     return OutputMeans.of(start, stop, which, reactions, scales, variances)
 
 

@@ -109,7 +109,7 @@ def during_turns(values: Float[Array, "m 3"], sample: Int[Array, "T S"]) -> Floa
 
 def samples_by_hand(segmentations: Sequence[Segmentation], observations: Observations) -> tuple[SamplesByHand, ...]:
     """Return the samples of each recording that poses and turns were cut from."""
-    interval, first, samples = observations.turns.interval, 0, []
+    interval, first, samples = np.asarray(observations.turns.interval), 0, []
     for part, shift in zip(segmentations, rest_shifts(segmentations), strict=True):
         samples.append(SamplesByHand.of(part, first, interval, shift))
         first += len(part.intervals)

@@ -389,7 +389,7 @@ def _alone(question: Question, cause: Cause) -> tuple[float, float]:
 def _upright(old: Old, recording: Recording, history: History, gravity: LocalGravity) -> None:
     """Raise `InputError` where gravity is far off in rests, which no calibration's age makes."""
     signal = recording.accelerometer
-    force = old.imu.with_effects().accelerometer.recover(signal.values)
+    force = np.asarray(old.imu.with_effects().accelerometer.recover(signal.values))
     size = lengths_of(interpolated(signal.time, force, history.time[history.rest] - INTERVAL / 2))
     off = float(np.median(np.abs(size - gravity.value)))
     if off > _FAR_OFF[0]:
@@ -563,7 +563,7 @@ def _output_errors(old: Old, fresh: Fresh, data: Data) -> dict[str, OutputError]
     by = data.rotations(eqx.tree_at(lambda imu: imu.gyroscope.bias, old.imu.with_effects(), after.bias))
     if len(by):
         # how each turn's rotation vector reacts to A = K⁻¹, the bias held: c = −A b
-        by = np.degrees(by[..., :3] - by[..., 3:] * after.bias)
+        by = np.degrees(by[..., :3] - by[..., 3:] * np.asarray(after.bias))
         inverse = np.linalg.inv(before.gain)
         vectors = np.einsum("tijk,jk->ti", by, np.linalg.inv(after.gain) - inverse)
         worst = int(np.argmax(lengths_of(vectors)))

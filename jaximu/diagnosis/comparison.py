@@ -77,7 +77,7 @@ class Old:
         covariance = np.zeros((len(names), len(names)))
         covariance[np.ix_(there, there)] = submatrix(calibration.covariance, columns)
         of_effects = 10 * np.maximum(np.maximum(np.abs(values), sigmas_of(covariance)), 1e-12)
-        sizes = np.concatenate([parameters.size, of_effects[len(parameters.names) :]])
+        sizes = np.concatenate([np.asarray(parameters.size), of_effects[len(parameters.names) :]])
         scales, units = np.ones(len(names)), []
         for k, name in enumerate(names):
             unit = triads[name.owner].output_unit

@@ -474,4 +474,4 @@ def _sizes(kind: type[Effect], imu: Imu) -> FloatArray:
     triad = imu.triads().get(kind.owner, imu.accelerometer)
     scale = float(np.mean(triad.scales))
     typical = {name: parameter.typical for name, parameter in kind.inner.items()}
-    return kind(np.zeros(kind.size), **typical).typical_sizes(scale).coefficients
+    return np.asarray(kind(np.zeros(kind.size), **typical).typical_sizes(scale).coefficients)

@@ -95,7 +95,7 @@ class Prior(eqx.Module):
                 raise InputError(f"a standard deviation must be greater than zero, found {np.min(width):g}.")
             if np.any(width):
                 names += [Name(owner, "coefficients", (k,), number) for k in range(effect.size)]
-                values += effect.coefficients.tolist()
+                values += np.asarray(effect.coefficients).tolist()
                 sigma += np.broadcast_to(width, effect.size).tolist()
         return cls(tuple(names), np.array(values), np.diag(1 / np.array(sigma))) if names else None
 
@@ -153,11 +153,11 @@ class Fit(eqx.Module):
 
         Rates times stamps are angles: stamps that run fast by a share make the gain K too large by it, dK = K dc.
         """
-        magnitude = self.magnitude_sensitivity * magnitude_sigma
+        magnitude = np.asarray(self.magnitude_sensitivity) * magnitude_sigma
         turning = [name.owner == "gyroscope" and name.part == "gain" for name in self.names]
-        clock = np.where(turning, self.values, 0.0) * clock_sigma
+        clock = np.where(turning, np.asarray(self.values), 0.0) * clock_sigma
         shifts = (shift[..., :, None] * shift[..., None, :] for shift in (magnitude, clock))
-        return sum(shifts, self.covariance)
+        return sum(shifts, np.asarray(self.covariance))
 
 
 def unwhitened(fitted: Fit, covariance: Covariance | Chain) -> tuple[FloatArray, FloatArray]:
@@ -169,8 +169,8 @@ def unwhitened(fitted: Fit, covariance: Covariance | Chain) -> tuple[FloatArray,
     def rows(covariance, excess, white):
         return covariance.weights(excess).unwhiten(white)
 
-    white = np.concatenate([fitted.residual[:, None], fitted.jacobian], axis=1)
-    conditions = stored.call(rows, "unwhitened", covariance, fitted.excess, white)
+    white = np.concatenate([np.asarray(fitted.residual)[:, None], fitted.jacobian], axis=1)
+    conditions = np.asarray(stored.call(rows, "unwhitened", covariance, np.asarray(fitted.excess), white))
     return conditions[:, 0], conditions[:, 1:]
 
 
@@ -283,7 +283,7 @@ def linearise(imu: Imu, measurement: Data, free: Callable[[Name], bool]) -> Line
         about.columns[0],
         first(about.covariance).dense().measured,
         (*parameters.names, *names),
-        np.concatenate([parameters.size, sizes]),
+        np.concatenate([np.asarray(parameters.size), sizes]),
         about.details,
         about.unknown,
     )

@@ -94,7 +94,7 @@ def weak_directions(
     Together the open directions span a subspace whose singular vectors are arbitrary mixtures; it is stated by a basis
     of few numbers each, the reduced row echelon form with columns pivoted (Businger and Golub, 1965).
     """
-    _, values, right = np.linalg.svd(jacobian, full_matrices=jacobian.shape[0] < jacobian.shape[1])
+    _, values, right = np.linalg.svd(np.asarray(jacobian), full_matrices=jacobian.shape[0] < jacobian.shape[1])
     values = np.pad(values, (0, len(right) - len(values)))  # fewer residuals than parameters
     spread = right / np.hypot(values, 1 / TOLERANCE)[:, None]  # covariance: spread.T @ spread
     sigmas, variance = lengths_of(spread), np.sum(spread**2, axis=0)
@@ -110,7 +110,7 @@ def weak_directions(
         main = [k for k in order[:4] if abs(vector[k]) > 0.3] or order[:4]  # many may take part a little
         others = [k for k in order if lost[k] and holder[k] == index and k not in main]
         named = tuple((names[k], float(vector[k])) for k in (*main, *others))
-        amounts = 1.96 * sigma * np.abs(vector) * sizes
+        amounts = 1.96 * sigma * np.abs(vector) * np.asarray(sizes)
         determined = index >= len(basis)
         what = _words([(names[k], float(amounts[k])) for k in main], len(others), determined, model)
         text = f"{what} What to record: {advice(vector, names, sizes, model)}"
@@ -174,7 +174,7 @@ def _in_si(
 ) -> tuple[FloatArray, FloatArray]:
     """A direction's change of a triad's gain (relative) and bias (SI)."""
     parts = {"gain": np.zeros((3, 3)), "bias": np.zeros(3)}
-    for name, weight, typical in zip(names, vector, sizes, strict=True):
+    for name, weight, typical in zip(names, vector, np.asarray(sizes), strict=True):
         if name.owner == triad and name.effect is None:
             parts[name.part][name.axes] += weight * typical
     scale = model.triads()[triad].scales if triad in model.triads() else np.ones(3)

@@ -196,7 +196,7 @@ class MeasuredErrors:
         tilt = scipy.spatial.transform.Rotation.from_rotvec(np.append(mounting.tilt, 0.0))
         whole = replace(known, quaternion=np.asarray(mounting.unit_attitude(known.quaternion))).rotation()
         velocity = known.velocities()
-        stamp = mounting.on_log(known.time)
+        stamp = np.asarray(mounting.on_log(known.time))
         felt = interpolated(middle, np.asarray(force), stamp)
         steady = np.ones(len(stamp), bool)
         notes: list[str] = []

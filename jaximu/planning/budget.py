@@ -230,13 +230,13 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
     start = with_effects(scheme.unit, fitted, [np.zeros(effect.size) for effect in fitted])
     parameters = Parameters.select(start, free_on_table(start, task.fitted))
     names, per = parameters.names, np.array([per_si(name, start) for name in parameters.names])
-    scale = parameters.size / per  # from z to the parameters' units
+    scale = np.asarray(parameters.size) / per  # from z to the parameters' units
     stations, moved = scheme.stations, _reaction(scheme)
     design, units = stored.call(_design, "budget design", stations, start, parameters)
     used = np.stack([stations.accelerometer_used, stations.gyroscope_used])[..., None, None]
     roots = np.concatenate([source.root for source in sources], axis=1)
     scattered = np.moveaxis((moved * used) @ roots, 2, 1).reshape(len(design), -1)
-    excess, jacobian = _expected_excess(design, scattered, units, stations)
+    excess, jacobian = _expected_excess(np.asarray(design), scattered, np.asarray(units), stations)
     by_means = np.asarray(_sensitivity(stations, start, parameters, excess)).reshape(len(names), -1)
     truth = _truth(scheme, start, names)
     slope = scale[:, None] * (by_means @ moved.reshape(by_means.shape[1], -1)) - truth
@@ -267,7 +267,7 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
         actual,
         _determined(jacobian, scale, sigma),
         excess,
-        tuple(weak.text for weak in weak_directions(jacobian, names, parameters.size, start)[1]),
+        tuple(weak.text for weak in weak_directions(jacobian, names, np.asarray(parameters.size), start)[1]),
         (),
         notes,
     )
@@ -379,7 +379,7 @@ def _check(
             (means[:, 0], means[:, 1]),
         )
         fit = fit_turntable(jax.tree.map(many, start), sessions, task.fitted)
-        off = (fit.values - flatten(unit)[indices]) / per
+        off = (np.asarray(fit.values) - flatten(unit)[indices]) / per
         return np.column_stack([off, np.asarray(fit.converged & fit.finite, float)])
 
     start = Imu(sheet(unit.accelerometer), None if unit.gyroscope is None else sheet(unit.gyroscope), unit.setup)

@@ -154,7 +154,7 @@ def root_of(covariance: FloatArray) -> FloatArray:
 
 def gravity_sensitivity(imu: Imu, names: Sequence[Name], gravity: LocalGravity) -> FloatArray:
     """Return what one sigma of gravity does to parameters (p,): the accelerometer's gain is in proportion to 1/g."""
-    gain = imu.accelerometer.gain * gravity.sigma / gravity.value
+    gain = np.asarray(imu.accelerometer.gain) * gravity.sigma / gravity.value
     return np.array([-gain[name.axes] if name.startswith("accelerometer.gain") else 0.0 for name in names])
 
 

@@ -150,7 +150,7 @@ def score(question: DesignQuestion, covariance: Float[Array, "p p"]) -> float:
     def value(question, covariance):
         return CRITERIA[question.criterion](covariance, question.weights)
 
-    return float(np.exp(stored.call(value, f"{question.key} score", question, covariance)))
+    return float(np.exp(stored.call(value, f"{question.key} score", question, np.asarray(covariance))))
 
 
 def objective(question: DesignQuestion, design: Design, step: Step) -> tuple[float, Step]:

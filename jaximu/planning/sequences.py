@@ -169,7 +169,7 @@ class Filter:
         filtered = measurement.filtered(self.imu)
         shared = np.append(self.index, len(flatten(self.imu)))
         rows = WhiteRows(*(np.asarray(array)[part] for array in filtered.rows))
-        start = Rotation.from_quat(filtered.path.attitude[part.start], scalar_first=True)
+        start = Rotation.from_quat(np.asarray(filtered.path.attitude)[part.start], scalar_first=True)
         return rows._replace(shared=rows.shared[..., shared]), start
 
     def _headed(self, rows: WhiteRows, ahead: Rotation) -> WhiteRows:
@@ -212,12 +212,12 @@ def filter_of(
         notes += ("the drift of the biases that is usual of MEMS sensors is assumed.",)
     imu = on_host(question.imu.with_effects(*chosen, GyroEarthRotation.dormant()))
     free = Parameters.select(imu, without_equipment_or_effects)
-    size = free.size
+    size = np.asarray(free.size)
     spread = plausible_sizes(imu) | {GyroEarthRotation.name: np.full(3, EARTH_RATE)}
     information = np.zeros((len(size) + 1, len(size) + 1))
     base = question.parameters
     inside = [free.names.index(name) for name in base.names]
-    information[np.ix_(inside, inside)] = question.prior / np.outer(base.size, base.size)
+    information[np.ix_(inside, inside)] = np.asarray(question.prior) / np.outer(base.size, base.size)
     for index, name in enumerate(free.names):
         if name.effect is not None:
             effect = imu.all_effects()[name.key]

@@ -338,7 +338,7 @@ def _attitude_roots(stops: _Stops, kind: str) -> dict[str, FloatArray]:
         "mounting": mounting,
         "orthogonality": np.stack([tilting, spindle], axis=2),
     }
-    return {name: root.reshape(3 * count, -1) for name, root in roots.items()}
+    return {name: np.asarray(root.reshape(3 * count, -1), np.float64) for name, root in roots.items()}
 
 
 def _mean_covariances(squares: Mapping[str, FloatArray], start: FloatArray, stop: FloatArray):
@@ -410,7 +410,7 @@ def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...]
         add(name, np.diag(sizes), coefficient)
         coefficient += len(sizes)
     if shaken := _stated(errors, "vibration").get("noise", 0.0):
-        during = (stations.turn & stations.gyroscope_used) / np.sqrt(_durations(stations))
+        during = np.asarray(stations.turn & stations.gyroscope_used) / np.sqrt(_durations(stations))
         scale = case.imu.triads()["gyroscope"].scales
         add("vibration", np.diag((shaken * scale[:, None] * during).ravel()), added + 3 * size)
     for name, covariances in (("noise", fast), ("bias_instability", slow)):
@@ -427,7 +427,7 @@ def _source(errors: StatedErrors, name: str, root: FloatArray) -> ErrorSource:
 
 def _durations(stations: Stations) -> FloatArray:
     """Durations (S,), s; one for padding."""
-    duration = stations.stop - stations.start
+    duration = np.asarray(stations.stop) - np.asarray(stations.start)
     return np.where(duration > 0, duration, 1.0)
 
 
@@ -452,11 +452,11 @@ def _with_noise(case: Case, stations: Stations, intervals: Sequence[ScheduleEntr
             notes.append(f"no white noise is stated for the {name}: {np.sqrt(density[0]):.2g} {unit} is assumed.")
         parts, ramps[name] = _mean_covariances(squares, *span.T), np.sqrt(squares.get("R", np.zeros(3)))
         scale = triad.scales[:, None, None]
-        there = used[name][:count]
+        there = np.asarray(used[name])[:count]
         for whole, part in zip((fast, slow), parts, strict=True):
             whole[3 * number : 3 * number + 3, :count, :count] = np.where(there[:, None] & there, part * scale**2, 0.0)
     total = fast + slow
-    unused = np.concatenate([np.tile(~mask, (3, 1)) for mask in used.values()])
+    unused = np.concatenate([np.tile(~np.asarray(mask), (3, 1)) for mask in used.values()])
     total += unused[:, :, None] * np.eye(size)
     stations = replace(stations, accelerometer_covariance=total[:3], gyroscope_covariance=total[3:])
     return stations, fast, slow, ramps, tuple(notes)
@@ -516,5 +516,5 @@ def _scheme(
     pace = np.einsum("sqi,si->sq", np.asarray(stations.stimulus.angular_rate), axis) / angle[:, None]
     done = (pace.cumsum(axis=1) - pace / 2) * (_durations(stations) / pace.shape[1])[:, None]
     rms = _stated(errors, "vibration").get("rms", 0.0)
-    power = np.where(stations.turn[:, None], rms**2, np.zeros_like(pace))
+    power = np.where(np.asarray(stations.turn)[:, None], rms**2, np.zeros_like(pace))
     return ErrorScheme(unit, effects, stations, motion, ends, done, pace, power, len(stops.up))

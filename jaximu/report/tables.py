@@ -61,11 +61,11 @@ def snippet(calibration: Calibration) -> str:
         if triad.effects:
             return ""
         short, known = name[0], _INPUTS[name]
-        gain = (",\n" + 16 * " ").join(listed(row) for row in triad.gain)
+        gain = (",\n" + 16 * " ").join(listed(row) for row in np.asarray(triad.gain))
         unit = "".join(letter for letter in triad.output_unit if letter.isprintable())
         lines += [
             f"K_{short} = np.array([{gain}])",
-            f"b_{short} = np.array({listed(triad.bias)})",
+            f"b_{short} = np.array({listed(np.asarray(triad.bias))})",
             f"{known.letter} = ({known.output} - b_{short}) @ np.linalg.inv(K_{short}).T"
             f"  # {known.code}, from {known.output}: (n, 3) in {unit}",
         ]
@@ -110,7 +110,7 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
             return _GIVEN
         if nominal is None and counts:
             return ""
-        start = 1.0 if nominal is None else nominal.gain[i, i]
+        start = 1.0 if nominal is None else np.asarray(nominal.gain)[i, i]
         if exchanged[i]:
             return _EXCHANGED
         change = with_interval(100 * (scale[i] / start - 1), 100 * gain_sigma[i, i] / abs(start), "%", sign=True)
@@ -186,9 +186,9 @@ def _ratio_sigma(calibration: Calibration, name: str, gain: FloatArray, i: int, 
 def equations(calibration: Calibration) -> Iterator[tuple[str, list[Part]]]:
     """Yield each triad's name and the equation that corrects its output, with K, its inverse, b and effects."""
     for name, triad in calibration.triads().items():
-        known, unit, gain = _INPUTS[name], unit_text(triad.output_unit), triad.gain
+        known, unit, gain = _INPUTS[name], unit_text(triad.output_unit), np.asarray(triad.gain)
         factor, inverse = _scaled(np.linalg.inv(gain))
-        bias_factor, bias = _scaled(triad.bias[:, None])
+        bias_factor, bias = _scaled(np.asarray(triad.bias)[:, None])
         gain_factor, entries = _scaled(gain)
         per = "(no unit)" if unit == known.si else f"{unit} per {known.si}"
         parts: list[Part] = [

@@ -144,7 +144,7 @@ def _axis(axis: Axis, labels: Sequence[str], ends: tuple[float, float]) -> Json:
     attributes |= {"scale": "date"} if isinstance(axis.get_converter(), DateConverter) else {}
     locator = axis.get_major_locator()
     if isinstance(locator, FixedLocator) or type(locator).__name__ == "StrCategoryLocator":
-        places = locator()
+        places = np.asarray(locator())
         texts = axis.get_major_formatter().format_ticks(list(places))
         if np.array_equal(places, np.arange(len(places))) and not any(map(str.isdecimal, texts)):
             attributes["names"] = [name.replace("\n", " ") for name in texts]
