@@ -1,5 +1,7 @@
 """Accept or reject calibrated units: every limit an item with value, uncertainty, probability and verdict."""
 
+from __future__ import annotations
+
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -7,6 +7,8 @@ risk, rejected where that of conformity is; undecided between. At a single limit
 standard uncertainties to both sides (JCGM 106, 8.3.2 and 8.3.3). *Simple*: the value alone decides (8.2).
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

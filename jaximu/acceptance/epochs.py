@@ -6,6 +6,8 @@ are those that limits are put on (`jaximu.acceptance.quantities`). Gravity's err
 that state the same gravity; it is taken out of the covariance where that holds it, and kept beside.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple

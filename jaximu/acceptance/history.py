@@ -7,6 +7,8 @@ all together; every number's p-value with all of them allowed for (Holm). Over d
 is its drift (`jaximu.acceptance.trend`), and which says when a limit's guard band is reached.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date, timedelta

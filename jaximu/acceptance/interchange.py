@@ -5,6 +5,8 @@ systems know pass and fail alone. What is undecided was not shown to conform and
 JUnit's words, in OpenHTF's a failure that is *marginal*, or *UNSET* where there is no value.
 """
 
+from __future__ import annotations
+
 import json
 import os
 from collections.abc import Iterator, Sequence

@@ -27,6 +27,8 @@ such a file, a table of `jaximu fleet` will do: limits are then tolerance interv
 with 95 % confidence.
 """
 
+from __future__ import annotations
+
 import math
 import os
 import re

@@ -1,5 +1,7 @@
 """A table of `jaximu fleet` held to limits and followed in time: verdicts by row, capability, charts, gauge, drift."""
 
+from __future__ import annotations
+
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence

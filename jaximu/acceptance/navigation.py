@@ -5,6 +5,8 @@ What the calibration leaves open, and the sensors' noise where an allan.json is 
 probability of conformity is that of an error within the limits.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any

@@ -12,6 +12,8 @@ rests on the scatter of n conditions beyond their known noise (a share s of it),
 the whole ν = (n − p) u⁴ / (s u²_recording)² (Welch and Satterthwaite, GUM G.4.1).
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product

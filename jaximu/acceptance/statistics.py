@@ -1,5 +1,7 @@
 """Statistics of a production line: capability, control charts, gauge studies, tolerance intervals, drift."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -6,6 +6,8 @@ chain at that place. There is no secret in it: whoever can change all files can 
 chain is its last hash, kept elsewhere (on the printed certificate).
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

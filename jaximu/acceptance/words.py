@@ -1,5 +1,7 @@
 """Names and amounts of what limits are put on, as a person says them."""
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

@@ -4,6 +4,8 @@ A calibration takes all of them in: its gain says how the output hangs together 
 columns are called. They are mistakes where somebody relies on the file's axes and units.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 
 import numpy as np

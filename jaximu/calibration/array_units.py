@@ -1,5 +1,7 @@
 """What is known of units on one rigid body, as `array.json` has it."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

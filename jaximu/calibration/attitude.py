@@ -1,5 +1,7 @@
 """Calibration against a measured attitude on its own clock: optics, an inertial system, a robot, a tracker."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any

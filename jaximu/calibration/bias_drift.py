@@ -1,5 +1,7 @@
 """A calibration whose biases are those of a time: after the recording, and in it."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import replace
 

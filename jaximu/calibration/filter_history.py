@@ -1,5 +1,7 @@
 """`History`: what a Kalman filter knew of a unit, and when."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

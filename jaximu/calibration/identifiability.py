@@ -1,5 +1,7 @@
 """What a path of temperature distinguishes, before any fit: in numbers and in words."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import NamedTuple
 

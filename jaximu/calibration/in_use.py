@@ -1,5 +1,7 @@
 """Re-estimation in use: a causal filter that follows a calibrated unit sample by sample, in constant memory."""
 
+from __future__ import annotations
+
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace

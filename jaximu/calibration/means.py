@@ -1,5 +1,7 @@
 """Calibration from a table of pose means, as papers print them: gravity's norm, and the gyroscope's bias at rest."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np

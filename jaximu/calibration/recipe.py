@@ -1,5 +1,7 @@
 """Calibration from recordings of poses and turns by hand, the one recipe behind [`jaximu.calibrate`][]."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace

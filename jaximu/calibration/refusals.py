@@ -1,5 +1,7 @@
 """What is no calibration, and is refused in a sentence that says what to record."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -5,6 +5,8 @@ for all axes a little above what was reached, and far better than with the cube 
 the range that is too small, and no nonlinearity of the sensor's.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np

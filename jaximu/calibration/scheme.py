@@ -4,6 +4,8 @@ Without effects the three axes of a triad share one design: the mean inputs ū o
 bias. A combination n of the four columns that no station excites, [ū 1] n = 0, is open in every axis: three parameters.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 

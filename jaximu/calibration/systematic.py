@@ -1,5 +1,7 @@
 """System-level calibration: a filter over a whole recording of rests and motion, iterated to convergence."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace

@@ -1,5 +1,7 @@
 """Calibration with equipment: known poses and turns, all 24 numbers of gain and bias, and nuisance effects (S8, S9)."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

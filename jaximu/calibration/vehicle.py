@@ -6,6 +6,8 @@ and before one the force less that at the stop adds up to a speed along the vehi
 direction in the horizontal plane along which these speeds lie best, in the sense of least squares, is the vehicle's.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from typing import Any
 

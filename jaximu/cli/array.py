@@ -1,5 +1,7 @@
 """`jaximu array`: several units on one rigid body."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 from jaximu.cli import options

@@ -1,5 +1,7 @@
 """`jaximu budget`: how each error of the set-up reaches each parameter."""
 
+from __future__ import annotations
+
 import inspect
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,5 +1,7 @@
 """`jaximu check`: is an old calibration still valid for a new recording, and what moved?"""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Annotated, Literal
 

@@ -1,5 +1,7 @@
 """`jaximu compare`: what moved between calibrations of a unit, and how it drifts over its history."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal

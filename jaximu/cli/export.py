@@ -1,5 +1,7 @@
 """`jaximu export`: a calibration as another tool's file, with the equation to apply and what the file leaves out."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,5 +1,7 @@
 """`jaximu filter`: calibration by a Kalman filter and smoother over a whole recording, and re-estimation in use."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

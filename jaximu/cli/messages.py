@@ -1,5 +1,7 @@
 """Prose for a person on stderr: how much of it a user wants, and how long the stages of the work take."""
 
+from __future__ import annotations
+
 import sys
 import time
 from collections.abc import Callable, Iterator

@@ -1,5 +1,7 @@
 """`jaximu simulate`: a specification into recordings and their truth."""
 
+from __future__ import annotations
+
 import inspect
 import json
 from dataclasses import MISSING, dataclass, fields

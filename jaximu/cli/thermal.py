@@ -1,5 +1,7 @@
 """`jaximu thermal`: bias over temperature, from recordings at rest or by hand."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal

@@ -1,5 +1,7 @@
 """What a verb takes, read from the fields of its class: its help, completion, and mistakes in its options."""
 
+from __future__ import annotations
+
 import difflib
 import inspect
 import itertools

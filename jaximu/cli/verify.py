@@ -1,5 +1,7 @@
 """`jaximu verify`: is a result what was written, and are the files it rests on what they were?"""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

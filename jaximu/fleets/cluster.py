@@ -1,5 +1,7 @@
 """The fleet's job on Ray: tasks read and segment files, actors fit batches, rows come back as they are done."""
 
+from __future__ import annotations
+
 import logging
 import os
 from collections.abc import Iterator, Sequence

@@ -4,6 +4,8 @@ An engine takes all jobs and the places of those that are wanted, and gives batc
 and empty ones while it waits.
 """
 
+from __future__ import annotations
+
 import multiprocessing
 import multiprocessing.connection
 import os

@@ -5,6 +5,8 @@ hard and soft iron are fitted by its recipe and in its programs, beside all othe
 the angle to gravity are not used, so the gain (lower triangle) is in the magnetometer's own axes.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from dataclasses import dataclass, replace
 

@@ -1,5 +1,7 @@
 """The fit of many units: those whose observations are of one kind and shape go through [`jaximu.fit`][] together."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial

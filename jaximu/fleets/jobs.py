@@ -1,5 +1,7 @@
 """What a fleet's run consists of: one `Job` a recording, and the `Settings` that all share."""
 
+from __future__ import annotations
+
 import csv
 import dataclasses
 import glob

@@ -1,5 +1,7 @@
 """A fleet's run: what is missing is computed by an engine and kept, and the table is written when all is there."""
 
+from __future__ import annotations
+
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence

@@ -1,5 +1,7 @@
 """The Earth's magnetic field at a place: stated, or of the World Magnetic Model, each with its uncertainty."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from datetime import date

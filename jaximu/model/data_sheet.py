@@ -4,6 +4,8 @@ A continuous density (N in rad/s/√Hz) belongs to the sensor. A discrete standa
 sensor at one sample rate: σ = N √rate for white noise, σ = K/√rate for the step of a random walk.
 """
 
+from __future__ import annotations
+
 import math
 import re
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """Many rows by a function that is compiled for a fixed number of them."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Standard deviations that are wanted of parameters: "accelerometer.bias 0.2 mg", for all alike or for one."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -6,6 +6,8 @@ edges and corners, whose rest and whose turn from the present one add most to wh
 all parameters alike (the D-criterion) where there is none.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

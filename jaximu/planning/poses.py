@@ -1,5 +1,7 @@
 """Poses that a person can set: rounded angles, an order with short ways, and words."""
 
+from __future__ import annotations
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 

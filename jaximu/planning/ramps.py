@@ -6,6 +6,8 @@ recording to come is worth half the logarithm of the factor by which it grows (n
 1956, 986–1005), summed over the effects that are hardly told now.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 

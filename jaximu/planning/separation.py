@@ -7,6 +7,8 @@ would ask is made from it. If cause i is there with coefficients c_i and the mod
 that of finding out that j does not explain the recording; of i for j and j for i the lesser counts.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 

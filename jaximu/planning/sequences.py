@@ -7,6 +7,8 @@ came before, but for the heading, which only the Earth's rotation feels; so few 
 tried.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 

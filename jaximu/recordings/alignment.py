@@ -5,6 +5,8 @@ rotation: Δf = f × M Δθ over a short time, Δθ the angle that the gyroscope
 in M, which is the identity for right axes, signs and scales.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from itertools import pairwise, permutations, product
 from typing import Any, NamedTuple

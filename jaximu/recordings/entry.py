@@ -1,5 +1,7 @@
 """`ScheduleEntry`: a pose or a turn, as a schedule, a protocol or a reference has it."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,5 +1,7 @@
 """Rows that a sensor itself flags: a status column is read, and rows off its usual value are left out."""
 
+from __future__ import annotations
+
 import re
 from dataclasses import replace
 

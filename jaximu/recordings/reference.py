@@ -4,6 +4,8 @@ Slips of people are looked for first: another clock, degrees for radians, an axi
 two names. Each is told as what it is, not as a bad fit afterwards.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -28,6 +28,8 @@
 Beside LOG, such a file called LOG.trace.toml is read without being named.
 """
 
+from __future__ import annotations
+
 import os
 from collections.abc import Callable, Mapping
 from datetime import date

@@ -1,5 +1,7 @@
 """The verdict on a unit as a page, and its certificate with what ISO/IEC 17025, 7.8.2 and 7.8.4, asks for."""
 
+from __future__ import annotations
+
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Sequence

@@ -1,5 +1,7 @@
 """The page of noise for estimators: by how much white noise is multiplied, what that is made of, where it holds."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,5 +1,7 @@
 """What the report shows of each pose and each turn: errors before and after, and what the noise explains."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,5 +1,7 @@
 """The page of all that logs allow: one verdict, what is in the logs, and a chapter for every verb that was run."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from typing import Any
 

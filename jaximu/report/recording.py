@@ -1,5 +1,7 @@
 """The page of a recording: which signals it holds, how they were sampled, and what was noticed."""
 
+from __future__ import annotations
+
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

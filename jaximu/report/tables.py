@@ -1,5 +1,7 @@
 """What the report says in numbers: parameters with intervals, the equation to apply, where it all comes from."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from itertools import permutations

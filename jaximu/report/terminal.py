@@ -1,5 +1,7 @@
 """A page as text: on the terminal with its colours, or as a string; square brackets are units, not markup."""
 
+from __future__ import annotations
+
 import io
 import os
 from collections.abc import Sequence

@@ -1,5 +1,7 @@
 """What the report says in sentences: what came out, what to trust, what the data cannot tell."""
 
+from __future__ import annotations
+
 import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path

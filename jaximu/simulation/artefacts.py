@@ -4,6 +4,8 @@ They work on one block of samples after another and keep between blocks what the
 length can be streamed. They are applied in the order in which they happen: in the sensor, its converter, the logger.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from dataclasses import dataclass
 from typing import Any, ClassVar

@@ -5,6 +5,8 @@ Names are read by `jaximu.recordings.columns.habits`. Physics knows a sensor by 
 quaternion. Where a column stands proves nothing. What neither settles is asked: a `?` in the line to paste.
 """
 
+from __future__ import annotations
+
 import math
 import re
 from collections.abc import Collection, Iterable, Sequence

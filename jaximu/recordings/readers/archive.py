@@ -1,5 +1,7 @@
 """Recordings of several files: the folder or ZIP archive in which a phone's app writes one file a sensor."""
 
+from __future__ import annotations
+
 import os
 import re
 import shlex

@@ -1,5 +1,7 @@
 """A reference's attitude from a file: quaternions, rotation vectors or angles, with velocity or position."""
 
+from __future__ import annotations
+
 import os
 import re
 from collections.abc import Sequence

@@ -4,6 +4,8 @@ Units and axes as ArduPilot's log documentation states them: µs, m/s², rad/s, 
 name instances IMU2, ACC1 …, newer ones hold them in the field I.
 """
 
+from __future__ import annotations
+
 import io
 import os
 from array import array

@@ -5,6 +5,8 @@ there white noise has E[n(t₁) n(t₂)] = σ² δ(t₁ − t₂), which is this
 of this library's K. A number that comes from anything else is to say so in its comment.
 """
 
+from __future__ import annotations
+
 import math
 import os
 import re

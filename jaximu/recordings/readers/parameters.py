@@ -4,6 +4,8 @@ Lists are QGroundControl's (`Vehicle-Id Component-Id Name Value Type`, its guide
 Planner and MAVProxy (`NAME,VALUE`, `NAME VALUE`).
 """
 
+from __future__ import annotations
+
 import difflib
 import math
 import re

@@ -4,6 +4,8 @@ A line's shape is the line with its numbers taken out. Where most lines have one
 other again and again, the numbers are columns, and the words before each are its name.
 """
 
+from __future__ import annotations
+
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence

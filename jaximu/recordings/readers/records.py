@@ -3,6 +3,8 @@
 Records that name their sensor (`"sensor": "Accelerometer"`) become tables of their own, each with its own stamps.
 """
 
+from __future__ import annotations
+
 import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence

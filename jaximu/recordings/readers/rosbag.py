@@ -5,6 +5,8 @@ makes Python code from those, and a bag is not trusted. In either wire format (R
 4-byte head) a stamp stands at byte 4 and the numbers, doubles, are the last part of the message.
 """
 
+from __future__ import annotations
+
 import io
 import os
 import tempfile

@@ -3,6 +3,8 @@
 Accelerometer and gyroscope have stamps of their own in them, and become tables of their own.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -4,6 +4,8 @@ logged), `sensor_combined`, and `vehicle_imu`.
 Units and axes as PX4's message definitions state them: µs, m/s², rad/s, °C, axes forward, right, down.
 """
 
+from __future__ import annotations
+
 import io
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import redirect_stdout

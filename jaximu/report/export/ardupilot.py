@@ -6,6 +6,8 @@ for misalignment, nor for a gyroscope's scale. Magnetometer, in milligauss: h = 
 diagonal and ODI beside it (xy, xz, yz), after its rotation ORIENT (AP_Compass_Backend.cpp, `correct_field`).
 """
 
+from __future__ import annotations
+
 from typing import ClassVar
 
 import numpy as np

@@ -1,5 +1,7 @@
 """What the autopilots' parameters have in common: offsets, the accelerometer's scale, a magnetometer's matrix."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass

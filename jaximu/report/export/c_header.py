@@ -5,6 +5,8 @@ times 2¹⁶ (m/s², µT) or 2²⁰ (rad/s). Inside, offsets keep 2⁻⁵ of an 
 of 32 bits overflows the 64 bits of the sum.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Every parameter as one line of CSV, with its unit and standard deviation; the effects' coefficients too."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from jaximu.ground.units import SENSOR_UNITS

@@ -5,6 +5,8 @@ units in which Fusion is fed, g and degrees per second; `FusionCalibrationMagnet
 S (y − b), in µT (x-io Technologies, Fusion, FusionCalibration.h). K⁻¹ = M s with a unit diagonal of M.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

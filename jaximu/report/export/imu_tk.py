@@ -4,6 +4,8 @@ u = T K' (y − b), as `CalibratedTriad::unbiasNormalize` applies what `Calibrat
 include/imu_tk/calibration.h); it subtracts its bias, unlike the paper it implements.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from jaximu.model.conventions import ImuTk

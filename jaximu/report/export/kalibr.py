@@ -5,6 +5,8 @@ kalibr_calibrate_imu_camera writes and uses them with `--imu-models scale-misali
 wiki pages "Yaml formats" and "Multi IMU and IMU intrinsic calibration"; Rehder et al., ICRA 2016).
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from jaximu.recordings.readers.kalibr import KALIBR_UNITS

@@ -7,6 +7,8 @@ hold has −1 at the head of its covariance, as `sensor_msgs/Imu` asks; a triad 
 began before the clock's zero is moved to begin there: stamps of ROS are not negative.
 """
 
+from __future__ import annotations
+
 import heapq
 import os
 import secrets

@@ -20,6 +20,8 @@ One table, `TARGETS`; a value is factor · densityᵉ · rateᵖ of a continuous
   `CovariancePrediction`).
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """Gains, biases, their inverse and the whole covariance as NumPy arrays, readable with `allow_pickle=False`."""
 
+from __future__ import annotations
+
 import io
 
 import numpy as np

@@ -6,6 +6,8 @@ Model "kalibr" keeps both triangles lower and R_IMUtoACC the identity. OpenVINS 
 its IMU frame, where Kalibr multiplies A with the one that C_gyro_i has rotated: Tg = A C_gyro_i.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from jaximu.report.export.base import (

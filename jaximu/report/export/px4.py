@@ -7,6 +7,8 @@ for a gyroscope's scale. Magnetometer, in gauss: h = R S (y − OFF), S symmetri
 beside it (xy, xz, yz), R the rotation ROT (Magnetometer.hpp, `Correct`).
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray

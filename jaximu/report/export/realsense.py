@@ -5,6 +5,8 @@ corrected = M y − b. The script solves rows [y, −1]·X = corrected and write
 bias that is subtracted after scaling, in m/s² and rad/s.
 """
 
+from __future__ import annotations
+
 import json
 
 import numpy as np

@@ -1,5 +1,7 @@
 """A ROS 2 parameter file: matrix and bias of each triad, row by row; any node applies it in one line."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from jaximu.ground.units import SENSOR_UNITS

@@ -9,6 +9,8 @@ and TMAX; T_cal is where its own offsets were calibrated (INS_ACCn_CALTEMP, INS_
 temperature, a lag, a hysteresis or a scale over temperature.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -8,6 +8,8 @@ with a whole Δt, and the true growth is σ² Δt² = N² Δt with σ = N √rat
 walk enters once a step, with variance (w Δt)², which is K² Δt for w = K √rate.
 """
 
+from __future__ import annotations
+
 from jaximu.report.export.base import ExportedUnit, Written, comments
 from jaximu.report.export.noise import TARGETS, noise_files, noise_values
 

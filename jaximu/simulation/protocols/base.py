@@ -1,5 +1,7 @@
 """The interface of a protocol: a recipe of motion and temperature."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
