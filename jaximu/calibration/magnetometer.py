@@ -51,8 +51,8 @@ _OTHER_UNITS = {"gauss": 100.0, "mgauss": 0.1, "nT": 1e-3, "mT": 1e3}
 _SCALE = 0.05
 """Share by which a data sheet's scale may be off, which the strength then is, too."""
 _SHEET_GAIN, _SHEET_BIAS = 0.02, 0.05
-"""Scale and misalignment of an accelerometer or a gyroscope, and an accelerometer's bias over gravity, by a data sheet
-(MPU-6050: 3 %, 2 %, 50 mg on x and y and 80 mg on z at the most)."""
+"""Scale and misalignment of an accelerometer, and its bias over gravity, by a data sheet (MPU-6050: 3 %, 2 %, 50 mg on
+x and y and 80 mg on z at the most)."""
 _FOLDS = 5
 _DISTURBED = 5.0
 """Standard deviations, by medians, of the strength from which on a stretch is left out."""
@@ -209,8 +209,8 @@ def _calibrated(
     base, notes = _base(logs, base, gravity)
     unit = _unit(logs, base)
     origin = np.zeros(3) if unit.gyroscope is None else np.asarray(unit.gyroscope.bias, float)
-    sensors = _uncertain_sensors(base)
-    parts = [windows_of(log.magnetometer, _corrected(log.recording, unit, base), origin, sensors) for log in logs]
+    vertical = _uncertain_force(base)
+    parts = [windows_of(log.magnetometer, _corrected(log.recording, unit, base), origin, vertical) for log in logs]
     windows = whole = FieldWindows.joined(parts)
     if southern is None and strength is not None and strength.dip is not None and abs(strength.dip) > _STEEP:
         southern = strength.dip < 0
@@ -309,30 +309,20 @@ def _base(
     return None, [f"accelerometer and gyroscope are taken as their data sheets say: {reason}"]
 
 
-def _uncertain_sensors(base: Calibration | None) -> FloatArray:
-    """Return how uncertain the other sensors are, as `FieldWindows.sensors`: as calibrated, or by a data sheet."""
+def _uncertain_force(base: Calibration | None) -> FloatArray:
+    """Return how uncertain the specific force is, as `FieldWindows.vertical`: as calibrated, or by a data sheet."""
     if base is None:
-        gains = np.full((2, 3, 3), _SHEET_GAIN)
-        gains[1] = np.tril(gains[1])
-        return np.diag(np.append(gains, np.full(3, _SHEET_BIAS)) ** 2)
-    known = base.of_numbers(
-        lambda name: (
-            name.effect is None and (name.owner == "accelerometer" or (name.owner, name.part) == ("gyroscope", "gain"))
-        )
-    )
-    reactions = np.zeros((len(known.names), 21))
-    for reaction, name in zip(reactions, known.names, strict=True):
-        change = np.zeros((3, 4))  # of the gain and, over gravity, of the bias
+        return np.diag(np.square([_SHEET_GAIN * (i >= j) for i in range(3) for j in range(3)] + 3 * [_SHEET_BIAS]))
+    known = base.of_numbers(lambda name: name.owner == "accelerometer" and name.effect is None)
+    changes = np.zeros((len(known.names), 3, 4))  # of the gain and, over gravity, of the bias
+    for change, name in zip(changes, known.names, strict=True):
         if name.part == "gain":
             change[name.axes] = 1.0
         else:
             change[name.axes[0], 3] = 1 / base.gravity.value
-        bent = -np.linalg.inv(base.imu.triads()[name.owner].gain) @ change
-        if name.owner == "gyroscope":
-            reaction[:9] = bent[:, :3].ravel()
-        else:
-            reaction[9:] = np.append(bent[:, :3], bent[:, 3])
-    return reactions.T @ known.covariance @ reactions
+    bent = -np.linalg.inv(base.imu.accelerometer.gain) @ changes
+    bent = np.concatenate([bent[:, :, :3].reshape(-1, 9), bent[:, :, 3]], axis=1)
+    return bent.T @ known.covariance @ bent
 
 
 def _unit(logs: Sequence[MagneticLog], base: Calibration | None) -> Imu:
@@ -780,7 +770,7 @@ def _dip(windows: FieldWindows, fit: Fit) -> tuple[float | None, float]:
     dip = float(np.arcsin(np.clip(middle, -1, 1)))
     spread = robust_sigma(sine - middle) / np.sqrt(max(calm.sum() / 4, 1))  # neighbours share their errors
     bent = windows.bent(field)[calm].mean(axis=0)
-    return dip, float(np.hypot(spread, np.sqrt(bent @ windows.sensors[9:, 9:] @ bent)) / max(np.cos(dip), 0.05))
+    return dip, float(np.hypot(spread, np.sqrt(bent @ windows.vertical @ bent)) / max(np.cos(dip), 0.05))
 
 
 def heading_errors(calibration: Calibration, start: Imu, strength: float, dip: float) -> Heading:

@@ -157,20 +157,19 @@ class FieldWindows:
     """What was recorded, in n windows, the last axis of a slope for (A | c).
 
     output (n, 3): mean output in each; slope (n, 3, 3, 4), carried, swept (n, 3, 3) and up (n, 3) as in
-    `FieldConditions`; bowed (n, 3, 9): how carried turns with C of `sensors`;
+    `FieldConditions`;
     off (n,): how far the specific force is from gravity, over gravity; angle (n,): rad turned to the next window;
     time (n, 2): s; count (n,): samples. used, turn, level (n,): which of them tell strength, turn and dip. noise: of a
     sample, output units. origin (3,): the gyroscope's bias, output units, that was taken off its rates. samples: of all
     windows, along which effects act.
-    sensors (21, 21): covariance of the other sensors' errors, which all windows share: of the angular rate w, C w, and
-    of the specific force f, B f + b g, with (C row by row | B row by row | b).
+    vertical (12, 12): covariance of what is wrong of the specific force f, (B f + b g) with (B row by row | b), which
+    bends the measured up of all windows together.
     """
 
     output: FloatArray
     slope: FloatArray
     carried: FloatArray
     swept: FloatArray
-    bowed: FloatArray
     up: FloatArray
     off: FloatArray
     angle: FloatArray
@@ -182,7 +181,7 @@ class FieldWindows:
     noise: float
     origin: FloatArray
     samples: FieldSamples
-    sensors: FloatArray
+    vertical: FloatArray
 
     def __len__(self) -> int:
         return len(self.output)
@@ -215,15 +214,11 @@ class FieldWindows:
         return self.level & (self.off < _CALM)
 
     def bent(self, field: FloatArray) -> FloatArray:
-        """Return how the sine (n,) of the angle from up to a field (n, 3) reacts to (B | b) of `sensors`, (n, 12)."""
+        """Return how the sine (n,) of the angle from up to a field (n, 3) reacts to what `vertical` is of, (n, 12)."""
         along = unit_vectors(field)
         across = along - np.sum(along * self.up, axis=1, keepdims=True) * self.up
         by_gain = np.einsum("ni,nj->nij", across, self.up).reshape(len(self), 9)
         return np.concatenate([by_gain, across], axis=1)
-
-    def turned(self, field: FloatArray) -> FloatArray:
-        """Return how a field (n, 3), carried from the next window, reacts to C of `sensors`, (n, 3, 9)."""
-        return np.cross(self.bowed, field[:, :, None], axis=1)
 
     def without(self, left_out: BoolArray) -> FieldWindows:
         """Return the same with some windows left out (n,)."""
@@ -234,11 +229,11 @@ class FieldWindows:
     @classmethod
     def joined(cls, parts: Sequence[FieldWindows]) -> FieldWindows:
         """Return windows of several recordings of one unit as one."""
-        names = "output slope carried swept bowed up off angle time count used turn level".split()
+        names = ("output", "slope", "carried", "swept", "up", "off", "angle", "time", "count", "used", "turn", "level")
         together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         noise = rms([part.noise for part in parts])
         samples = FieldSamples.joined([part.samples for part in parts])
-        return cls(**together, noise=noise, origin=parts[0].origin, samples=samples, sensors=parts[0].sensors)
+        return cls(**together, noise=noise, origin=parts[0].origin, samples=samples, vertical=parts[0].vertical)
 
 
 def white_noise(signal: Signal) -> float:
@@ -251,12 +246,12 @@ def white_noise(signal: Signal) -> float:
 
 
 def windows_of(
-    signal: Signal, motion: Recording | None, origin: FloatArray, sensors: FloatArray | None = None
+    signal: Signal, motion: Recording | None, origin: FloatArray, vertical: FloatArray | None = None
 ) -> FieldWindows:
     """Cut a magnetometer's samples (any unit) into windows, spread along the field's path over the sphere.
 
     `motion`: the same unit's specific force (m/s²) and, if known, angular rate (rad/s), corrected, on the same clock;
-    `origin`: the gyroscope's bias (3,), output units, with which it was; `sensors`: as in `FieldWindows`, None for 0.
+    `origin`: the gyroscope's bias (3,), output units, with which it was; `vertical`: as in `FieldWindows`, None for 0.
     """
     gyroscope = None if motion is None else motion.gyroscope
     time, values = signal.time, signal.values
@@ -273,7 +268,7 @@ def windows_of(
     index = np.minimum(edges[:-1, None] + np.arange(count.max()), stops[:, None] - 1)
     weight = (np.arange(count.max()) < count[:, None]) / count[:, None]
     centre = (time[edges[:-1]] + time[stops - 1]) / 2
-    turned, carried, swept, bowed, angle = _frames(gyroscope, centre, time[index])
+    turned, carried, swept, angle = _frames(gyroscope, centre, time[index])
     with_one = np.concatenate([values[index], np.ones((*index.shape, 1))], axis=2)
     slope = np.einsum("ns,nsij,nsk->nijk", weight, turned, with_one)
     up, off = np.zeros((len(centre), 3)), np.ones(len(centre))
@@ -294,7 +289,6 @@ def windows_of(
         slope,
         carried,
         swept,
-        bowed,
         up,
         off,
         angle,
@@ -306,22 +300,21 @@ def windows_of(
         white_noise(signal),
         origin,
         samples,
-        np.zeros((21, 21)) if sensors is None else sensors,
+        np.zeros((12, 12)) if vertical is None else vertical,
     )
 
 
 def _frames(
     gyroscope: Signal | None, centre: FloatArray, times: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return how windows stand, by the gyroscope: none of them turns without one.
 
     Rotations (n, S, 3, 3) from the samples' frames at `times` to the windows' at their `centre`, then (n, 3, 3) from
-    the next window's to each one's, how that turns with the rate (s) and with the gain (n, 3, 9), and by how much it
-    turns (n,), rad.
+    the next window's to each one's, how that turns with the rate (s), and by how much it turns (n,), rad.
     """
     count = len(centre)
     turned, carried = (np.array(np.broadcast_to(np.eye(3), (*size, 3, 3))) for size in (times.shape, (count,)))
-    swept, angle = np.zeros((count, 3, 3, 4)), np.zeros(count)
+    swept, angle = np.zeros((count, 3, 3)), np.zeros(count)
     if gyroscope is not None:
         attitude, turned_until = _carried(gyroscope)
         middle = attitude(centre)
@@ -330,8 +323,8 @@ def _frames(
         turned = np.einsum("nij,nsjk->nsik", back.as_matrix(), frames)
         step = back[:-1] * middle[1:]
         carried[:-1], angle[:-1] = step.as_matrix(), step.magnitude()
-        swept[:-1] = np.einsum("nhi,nijk->nhjk", back[:-1].as_matrix(), np.diff(turned_until(centre), axis=0))
-    return turned, carried, swept[..., 0], swept[..., 1:].reshape(count, 3, 9), angle
+        swept[:-1] = back[:-1].as_matrix() @ np.diff(turned_until(centre), axis=0)
+    return turned, carried, swept, angle
 
 
 def _edges(time: FloatArray, values: FloatArray, rate: float, most: int) -> IntArray:
@@ -347,19 +340,18 @@ def _edges(time: FloatArray, values: FloatArray, rate: float, most: int) -> IntA
 
 
 def _carried(gyroscope: Signal):
-    """Return, of times, attitudes (SciPy rotations) and how far (n, 3, 3, 4) wrong rates have turned them.
+    """Return, of times, attitudes (SciPy rotations) and how far (n, 3, 3), s, rates off by a constant have turned them.
 
-    Both against the frame in which the recording began; off by a constant (s), then by a share of each rate.
+    Both against the frame in which the recording began.
     """
     edges, count = gyroscope.edges, len(gyroscope)
     padding = (0, (1 << count.bit_length()) - count)  # few shapes are compiled
     rates, held = np.pad(gyroscope.values, (padding, (0, 0))), np.pad(np.diff(edges), padding)
     running, sweep = (leaf[:count] for leaf in stored.call(turned_by_rates, "carried attitude", rates, held))
     frames = scipy.spatial.transform.Rotation.from_quat(np.vstack([[1.0, 0.0, 0.0, 0.0], running]), scalar_first=True)
-    wrong = np.pad(gyroscope.values, ((0, 0), (1, 0)), constant_values=1.0)
-    swept = np.cumulative_sum(sweep[..., None] * wrong[:, None, None], axis=0, include_initial=True)
+    swept = np.cumulative_sum(sweep.reshape(-1, 9), axis=0, include_initial=True)
     reached = scipy.interpolate.make_interp_spline(edges, swept, k=1)
-    return scipy.spatial.transform.Slerp(edges, frames), reached
+    return scipy.spatial.transform.Slerp(edges, frames), lambda times: reached(times).reshape(-1, 3, 3)
 
 
 class _At(eqx.Module):
@@ -474,12 +466,9 @@ class MagneticField(OfOneUnit):
         measured = shaken.component(rows) + self._common() ** 2 * np.outer(level, level) + np.diag(1e-9 * used)
         if not windows.alone:
             bent = windows.bent(field) * windows.level[:, None]
-            turns = (basis @ windows.turned(field)).reshape(2 * n, 9) * np.repeat(windows.turn, 2)[:, None]
-            shared = scipy.linalg.block_diag(turns, bent)
             # what the hand and the accelerometer's errors do to its length, they do across it, where nothing shows it
             shaken_up = robust_sigma(windows.off) * lengths_of(bent[:, 9:])
-            measured[n:, n:] += shared @ windows.sensors @ shared.T
-            measured[3 * n :, 3 * n :] += np.diag(shaken_up**2)
+            measured[3 * n :, 3 * n :] += bent @ windows.vertical @ bent.T + np.diag(shaken_up**2)
         return Covariance(measured, tuple(factors), used, group)
 
 
