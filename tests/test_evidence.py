@@ -324,7 +324,7 @@ def test_two_effects_are_found_as_a_pair():
 
 
 def test_what_begins_anew_in_each_recording_does_not_go_on_over_all():
-    """A ramp over both is like the same warm-up in each: more than either alone, and less than both."""
+    """A ramp over both is like the same weak warm-up in each: it explains more than one alone, and less than both."""
     random = np.random.default_rng(31)
     jacobian, none = random.standard_normal((120, 6)), np.zeros((60, 3))
     warm_up = random.standard_normal((60, 3))
@@ -335,16 +335,14 @@ def test_what_begins_anew_in_each_recording_does_not_go_on_over_all():
         "gyro.warm_up@2": np.concatenate([none, warm_up]),
     }
     blocks = [EffectBlock(name, matrix, np.ones(3)) for name, matrix in columns.items()]
-    expected = {("gyro.warm_up@1", "gyro.warm_up@2"): 0, ("gyro.ramp@all",): 0}
-    for hidden in expected:
+    named = {("gyro.warm_up@1", "gyro.warm_up@2"): 0, ("gyro.ramp@all",): 0}
+    for hidden in named:
         for _ in range(20):
-            residual = random.standard_normal(120) + 2 * sum(columns[name].sum(axis=1) for name in hidden)
+            residual = random.standard_normal(120) + 0.6 * sum(columns[name].sum(axis=1) for name in hidden)
             evidence = Evidence(residual, jacobian, blocks)
-            scores = evidence.scores()
-            assert np.argmax(scores.statistic) == 0  # alone it explains the most
-            causes = select(evidence).causes
-            expected[hidden] += sorted(blocks[cause.block].name for cause in causes) == sorted(hidden)
-    assert min(expected.values()) >= 18, expected
+            assert np.argmax(evidence.scores().statistic) == 0  # alone it explains the most
+            named[hidden] += "gyro.ramp@all" in {blocks[cause.block].name for cause in select(evidence).causes}
+    assert list(named.values()) == [0, 20]
 
 
 def outside_of(jacobian, blocks, random, size):

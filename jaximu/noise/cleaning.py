@@ -20,9 +20,6 @@ _SPIKE = 8.0
 """Standard deviations off its neighbours from which a sample is an outlier: Gaussian noise has none in 10¹⁴."""
 FALSE_LINE = 1e-6
 """Probability that noise alone shows a line somewhere on an axis."""
-_LEAST = 1e-6
-"""Share of the noise's power below which a line is none: where a filter left nothing else. In white noise of less than
-eighty million samples no line that stands out is smaller."""
 _MOST_LINES = 20
 
 
@@ -161,8 +158,7 @@ def _peaks(values: FloatArray, last: int | None) -> list[tuple[int, int, int]]:
     if not len(high):
         return []
     middle = np.log(np.sqrt((edges[:-1] + 1.0) * edges[1:]))
-    least = _LEAST * float(median @ np.diff(edges))
-    high = high[power[high] > np.maximum(factor * np.exp(np.interp(np.log(high + 1.0), middle, np.log(median))), least)]
+    high = high[power[high] > factor * np.exp(np.interp(np.log(high + 1.0), middle, np.log(median)))]
     peaks = []
     for group in np.split(high, 1 + np.flatnonzero(np.diff(high) > 6)):
         if len(group):
