@@ -330,18 +330,18 @@ def test_what_begins_anew_in_each_recording_does_not_go_on_over_all():
     warm_up = random.standard_normal((60, 3))
     ramp = warm_up + 0.6 * random.standard_normal((60, 3))
     columns = {
-        "gyro.ramp@all": np.concatenate([ramp, ramp]),
+        "gyro.bias_ramp@all": np.concatenate([ramp, ramp]),
         "gyro.warm_up@1": np.concatenate([warm_up, none]),
         "gyro.warm_up@2": np.concatenate([none, warm_up]),
     }
     blocks = [EffectBlock(name, matrix, np.ones(3)) for name, matrix in columns.items()]
-    named = {("gyro.warm_up@1", "gyro.warm_up@2"): 0, ("gyro.ramp@all",): 0}
+    named = {("gyro.warm_up@1", "gyro.warm_up@2"): 0, ("gyro.bias_ramp@all",): 0}
     for hidden in named:
         for _ in range(20):
             residual = random.standard_normal(120) + 0.6 * sum(columns[name].sum(axis=1) for name in hidden)
             evidence = Evidence(residual, jacobian, blocks)
             assert np.argmax(evidence.scores().statistic) == 0  # alone it explains the most
-            named[hidden] += "gyro.ramp@all" in {blocks[cause.block].name for cause in select(evidence).causes}
+            named[hidden] += "gyro.bias_ramp@all" in {blocks[cause.block].name for cause in select(evidence).causes}
     assert list(named.values()) == [0, 20]
 
 

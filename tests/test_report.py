@@ -8,18 +8,21 @@ import subprocess
 import sys
 from dataclasses import replace
 from html.parser import HTMLParser
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from jaximu import InputError, LocalGravity, calibrate, compensate, load_calibration
+from jaximu.diagnosis.improvement import Gain, Prediction
 from jaximu.estimation.problem import TOLERANCE, Parameters, names_of
 from jaximu.estimation.uncertainty import WeakDirection, weak_directions
 from jaximu.ground.quantities import number
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
 from jaximu.report import write_report
+from jaximu.report.diagnosis import gained
 from jaximu.report.evidence import evidence, largest_gap
 from jaximu.report.figures import dressed, envelope, logarithmic, new_figure, residual_figure
 from jaximu.report.tables import short_name, snippet
@@ -365,3 +368,26 @@ def test_panels_leave_room_for_their_words(rows, columns):
     for place, box in enumerate(boxes):
         assert box.xmin >= 0 and box.ymin >= 0 and box.xmax <= figure.bbox.xmax and box.ymax <= figure.bbox.ymax
         assert not any(box.overlaps(other) for other in boxes[:place])
+
+
+@pytest.mark.parametrize(
+    ("after", "likelier", "says"),
+    [
+        (20.0, 9.0, "Modelling it cuts the error on data not fitted (5 parts) from 39.0 to 20.0 mm/s²."),
+        (
+            39.9,
+            9.0,
+            "more probable (log-likelihood +9.0), although their error does not fall: from 39.0 to 39.9 mm/s².",
+        ),
+        (39.9, -9.0, "Modelling it does not reduce the error on data not fitted (5 parts), 39.9 mm/s²."),
+    ],
+)
+def test_a_gain_is_said_in_the_measure_that_is_shown(after, likelier, says):
+    """An error that grows is not called the same, however much more probable the data became."""
+
+    def predicted(rms, likelihood):
+        return Prediction({"gravity_norm": (1e-3 * rms, "m/s^2")}, 1.0, 10, likelihood)
+
+    gain = Gain(predicted(39.0, 0.0), predicted(after, likelier), "5 parts")
+    cause = SimpleNamespace(effect=CATALOGUE["accel.step"].make(0.01))
+    assert gained(SimpleNamespace(gain=gain, learned=None, named=[cause])).endswith(says)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaximu.diagnosis.evidence import FAMILY_LEVEL, EffectBlock, Evidence, Scores
+from jaximu.model.effects import CATALOGUE
 
 LEVEL = FAMILY_LEVEL
 """Rate of false alarms over all tests together."""
@@ -169,12 +170,12 @@ def _leaders(evidence: Evidence, scores: Scores) -> list[int]:
         if block.name not in leaders or scores.statistic[k] > scores.statistic[leaders[block.name]]:
             leaders[block.name] = k
     ranks = {name: criterion(evidence, scores, k) for name, k in leaders.items()}
-    for name in [name for name in leaders if name.endswith("@all")]:
-        alone: dict[str, float] = {}
-        for other, rank in ranks.items():
-            number = other.partition("@")[2]
-            if number.isdecimal() and other.partition(".")[0] == name.partition(".")[0]:
-                alone[number] = max(alone.get(number, -np.inf), rank)
+    kinds = {name: CATALOGUE[name] for name in ranks if name in CATALOGUE}
+    for name in [name for name, kind in kinds.items() if kind.throughout_all]:
+        alone: dict[int, float] = {}
+        for other, kind in kinds.items():
+            if kind.recording and kind.owner == kinds[name].owner:
+                alone[kind.recording] = max(alone.get(kind.recording, -np.inf), ranks[other])
         if len(alone) > 1 and sum(alone.values()) > ranks[name]:
             del leaders[name]
     return sorted(leaders.values(), key=lambda k: -ranks[evidence.blocks[k].name])

@@ -58,7 +58,7 @@ def page_of(diagnosis: Diagnosis) -> Page:
 
     return Page(
         f"Diagnosis of {file_names(diagnosis.calibration.files)}: {diagnosis.verdict}",
-        [*filter(None, (*_what_is_wrong(diagnosis), _gained(diagnosis)))],
+        [*filter(None, (*_what_is_wrong(diagnosis), gained(diagnosis)))],
         *_number(diagnosis),
         [*_first(diagnosis, twin)],
         rest=partial(_rest, diagnosis, twin),
@@ -162,7 +162,7 @@ def _causes(diagnosis: Diagnosis) -> str:
     return "; ".join(texts)
 
 
-def _gained(diagnosis: Diagnosis) -> str:
+def gained(diagnosis: Diagnosis) -> str:
     """Say what modelling the causes, or else the smooth curve, gains on data that was not fitted."""
     gain, learned = diagnosis.gain, diagnosis.learned
     effects = [cause.effect for cause in diagnosis.named]
@@ -177,7 +177,8 @@ def _gained(diagnosis: Diagnosis) -> str:
     data = f"the error on data not fitted ({gain.data})"
     if after >= before and gain.log_likelihood > 0:
         likelier = f"data not fitted ({gain.data}) more probable (log-likelihood {gain.log_likelihood:+.1f})"
-        return f"Modelling {subject} makes {likelier}; their error stays near {size(after, unit)}."
+        errors = change(before, after, unit).replace("→", "to")
+        return f"Modelling {subject} makes {likelier}, although their error does not fall: from {errors}."
     if after >= before:
         return f"Modelling {subject} does not reduce {data}, {size(after, unit)}."
     little = "only " if after > _LITTLE * before else ""

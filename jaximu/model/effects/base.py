@@ -87,6 +87,7 @@ class Effect(eqx.Module):
     scope: ClassVar[str]  # "device" (belongs to the unit), "session" (to this recording) or "fixture" (to the set-up)
     recording: ClassVar[int] = 0  # of several, the number of the only one in which it acts; 0: it acts in all of them
     carries_on: ClassVar[bool] = False  # its time may go on from one recording to the next that follows it
+    throughout_all: ClassVar[bool] = False  # it does, as the effect called "NAME@all"
     needs: ClassVar[tuple[str, ...]]  # fields of the stimulus
     excited_by: ClassVar[str]
     look_alikes: ClassVar[tuple[str, ...]] = ()
@@ -112,7 +113,7 @@ class Effect(eqx.Module):
             cls.owner = SENSORS.get(prefix, prefix)
             common = cls.common_name or cls.plain.replace("_", " ")
             within = f" in recording {cls.recording}" if cls.recording else ""
-            within = " over all recordings" if cls.name.endswith("@all") else within
+            within = " over all recordings" if cls.throughout_all else within
             cls.english = (common if prefix == "setup" else f"{cls.owner} {common}") + within
             cls.title = f"{cls.english} ({cls.name})"
             if not cls.built_in():
@@ -264,8 +265,9 @@ def _throughout(whole: Any) -> Any:
     def grid(cls, extent):
         return whole.grid(extent._replace(duration=extent.session))
 
-    stated = {"name": f"{whole.name}@all", "term": term, "grid": classmethod(grid), "__module__": whole.__module__}
-    return type(whole)(f"{whole.__name__}Throughout", (whole,), stated)
+    stated = {"name": f"{whole.name}@all", "throughout_all": True, "__module__": whole.__module__}
+    changed = {"term": term, "grid": classmethod(grid)}
+    return type(whole)(f"{whole.__name__}Throughout", (whole,), stated | changed)
 
 
 class BiasEffect(Effect):
