@@ -6,6 +6,7 @@ the outputs of the run. The measured data is in the folder that JAXIMU_DATA name
 """
 
 import argparse
+import asyncio
 import html
 import os
 import re
@@ -90,7 +91,7 @@ def differences(stored: Notebook, run: Notebook) -> Iterator[str]:
                 break
 
 
-def execute(path: Path) -> tuple[Notebook, Notebook]:
+async def execute(path: Path, free: asyncio.Semaphore) -> tuple[Notebook, Notebook]:
     """Return a notebook as it is stored, and as it is after a run in its folder, without paths of this machine."""
     import nbformat
     from nbclient import NotebookClient
@@ -98,7 +99,9 @@ def execute(path: Path) -> tuple[Notebook, Notebook]:
     text = path.read_text(encoding="utf-8")
     stored, run = nbformat.reads(text, 4), nbformat.reads(text, 4)
     place = {"metadata": {"path": str(path.parent)}}
-    NotebookClient(run, timeout=TIMEOUT, resources=place, coalesce_streams=True, record_timing=False).execute()
+    client = NotebookClient(run, timeout=TIMEOUT, resources=place, coalesce_streams=True, record_timing=False)
+    async with free:
+        await client.async_execute()
     run.metadata = stored.metadata
     for cell in run.cells:
         if "outputs" in cell:
@@ -109,33 +112,39 @@ def execute(path: Path) -> tuple[Notebook, Notebook]:
     return stored, nbformat.reads(text, 4)
 
 
-def main() -> None:
+async def compared(paths: list[Path], write: bool) -> bool:
+    """Run notebooks, as many at a time as there are cores, say how each compares; return whether all ran and agree."""
     import nbformat
     from nbclient.exceptions import CellExecutionError
 
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("notebooks", nargs="*", type=Path, metavar="NOTEBOOK", help="Default: all, beside this script.")
-    parser.add_argument("--write", action="store_true", help="Store the outputs of the run.")
-    options = parser.parse_args()
-    failed = False
-    paths = options.notebooks or sorted(HERE.glob("*.ipynb"), key=lambda path: int(path.stem.partition("_")[0]))
-    if not paths:
-        parser.error(f"there is no notebook in {HERE}.")
-    for path in paths:
+    free = asyncio.Semaphore(os.cpu_count() or 1)
+    runs, fine = [asyncio.create_task(execute(path, free)) for path in paths], True
+    for path, ended in zip(paths, runs, strict=True):
         try:
-            stored, run = execute(path)
+            stored, run = await ended
         except CellExecutionError as error:
             print(f"{path.name}: {error}", flush=True)
-            failed = True
+            fine = False
             continue
         different = list(differences(stored, run))
         count = f"{len(different)} cell{' differs' if len(different) == 1 else 's differ'}"
         print("\n".join([f"{path.name}: {count}", *different]), flush=True)
-        if options.write:
+        if write:
             nbformat.write(run, path)
         else:
-            failed |= bool(different)
-    sys.exit(failed)
+            fine &= not different
+    return fine
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("notebooks", nargs="*", type=Path, metavar="NOTEBOOK", help="Default: all, beside this script.")
+    parser.add_argument("--write", action="store_true", help="Store the outputs of the run.")
+    options = parser.parse_args()
+    paths = options.notebooks or sorted(HERE.glob("*.ipynb"), key=lambda path: int(path.stem.partition("_")[0]))
+    if not paths:
+        parser.error(f"there is no notebook in {HERE}.")
+    sys.exit(not asyncio.run(compared(paths, options.write)))
 
 
 if __name__ == "__main__":
