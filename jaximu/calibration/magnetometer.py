@@ -51,8 +51,8 @@ _OTHER_UNITS = {"gauss": 100.0, "mgauss": 0.1, "nT": 1e-3, "mT": 1e3}
 _SCALE = 0.05
 """Share by which a data sheet's scale may be off, which the strength then is, too."""
 _SHEET_GAIN, _SHEET_BIAS = 0.02, 0.05
-"""Scale and misalignment of an accelerometer, and its bias over gravity, by a data sheet (MPU-6050: 3 %, 2 %, 50 mg on
-x and y and 80 mg on z at the most)."""
+"""Scale and misalignment of an accelerometer or a gyroscope, and an accelerometer's bias over gravity, by a data sheet
+(MPU-6050: 3 %, 2 %, 50 mg on x and y and 80 mg on z at the most)."""
 _FOLDS = 5
 _DISTURBED = 5.0
 """Standard deviations, by medians, of the strength from which on a stretch is left out."""
@@ -210,7 +210,8 @@ def _calibrated(
     unit = _unit(logs, base)
     origin = np.zeros(3) if unit.gyroscope is None else np.asarray(unit.gyroscope.bias, float)
     vertical = _uncertain_force(base)
-    parts = [windows_of(log.magnetometer, _corrected(log.recording, unit, base), origin, vertical) for log in logs]
+    motions = [_corrected(log.recording, unit, base) for log in logs]
+    parts = _windows(logs, motions, origin, vertical)
     windows = whole = FieldWindows.joined(parts)
     if southern is None and strength is not None and strength.dip is not None and abs(strength.dip) > _STEEP:
         southern = strength.dip < 0
@@ -242,6 +243,9 @@ def _calibrated(
     if wider is not None:
         fit = replace(fit, covariance=wider)
         notes.append(_ALIKE_ERRORS)
+    if windows.turn.any():
+        shifts = _wrong_turns(fit, windows, field, full, logs, motions, _uncertain_turns(unit, base))
+        fit = replace(fit, covariance=fit.covariance + shifts.T @ shifts)
     fit = informed(fit, _data_sheet(fit, start))
     spreads, headings = _left_out(fit, start, windows, field, full, _samples(logs, parts))
     dip, dip_sigma = _dip(windows, fit)
@@ -323,6 +327,56 @@ def _uncertain_force(base: Calibration | None) -> FloatArray:
     bent = -np.linalg.inv(base.imu.accelerometer.gain) @ changes
     bent = np.concatenate([bent[:, :, :3].reshape(-1, 9), bent[:, :, 3]], axis=1)
     return bent.T @ known.covariance @ bent
+
+
+def _uncertain_turns(unit: Imu, base: Calibration | None) -> FloatArray:
+    """Return by what share (k, 3, 3) of itself the rate may be off, one standard deviation each, as calibrated or by a
+    data sheet.
+    """
+    if base is None:
+        return _SHEET_GAIN * np.eye(9).reshape(9, 3, 3)
+    known = base.of_numbers(lambda name: (name.owner, name.part) == ("gyroscope", "gain"))
+    values, vectors = np.linalg.eigh(known.covariance)
+    errors = np.zeros((len(values), 3, 3))
+    for name, row in zip(known.names, vectors * root_or_zero(values), strict=True):
+        errors[:, *name.axes] = row
+    return np.linalg.inv(unit.triads()["gyroscope"].gain) @ errors
+
+
+def _wrong_turns(
+    fit: Fit,
+    windows: FieldWindows,
+    field: FieldStrength,
+    full: bool,
+    logs: Sequence[MagneticLog],
+    motions: Sequence[Recording | None],
+    errors: FloatArray,
+) -> FloatArray:
+    """Return how the numbers (k, p) of a fit change where the rates are off by shares (k, 3, 3) of themselves.
+
+    They turn the field that is carried, and with it the magnetometer's axes. They are no part of what the fit weighs:
+    beside strengths, which they do not reach, turns would hardly count.
+    """
+    used, changes = {name: getattr(windows, name) for name in ("used", "turn", "level")}, []
+    for error in errors:
+        wrong = [None if motion is None else _turned(motion, error) for motion in motions]
+        other = FieldWindows.joined(_windows(logs, wrong, windows.origin, windows.vertical))
+        refitted = _fitted(fit.imu, replace(other, **used), field, full, np.asarray(fit.excess))
+        changes.append(np.asarray(refitted.values) - np.asarray(fit.values))
+    return np.array(changes)
+
+
+def _turned(motion: Recording, error: FloatArray) -> Recording:
+    """Return a recording whose angular rate is off by a share (3, 3) of itself."""
+    gyroscope = motion.gyroscope
+    assert gyroscope is not None
+    return replace(motion, gyroscope=replace(gyroscope, values=gyroscope.values @ (np.eye(3) + error).T))
+
+
+def _windows(
+    logs: Sequence[MagneticLog], motions: Sequence[Recording | None], origin: FloatArray, vertical: FloatArray
+) -> list[FieldWindows]:
+    return [windows_of(log.magnetometer, motion, origin, vertical) for log, motion in zip(logs, motions, strict=True)]
 
 
 def _unit(logs: Sequence[MagneticLog], base: Calibration | None) -> Imu:
