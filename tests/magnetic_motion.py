@@ -1,5 +1,6 @@
 """A unit turned about in a magnetic field, made with SciPy's rotations alone: truth for tests of magnetometers."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,17 @@ class Turned(NamedTuple):
     bias: np.ndarray
     strength: float
     dip: float
+
+
+def bent(case: Turned, seed: int, share: float = 0.01) -> Recording:
+    """What an uncalibrated IMU recorded of it: scale and misalignment off by a share, drawn anew for each number."""
+    gyroscope, accelerometer = np.eye(3) + share * np.random.default_rng(seed).standard_normal((2, 3, 3))
+    gains = {"gyroscope": gyroscope, "accelerometer": np.tril(accelerometer)}
+    signals = {
+        name: replace(case.recording.signals[name], values=case.recording.signals[name].values @ gain.T)
+        for name, gain in gains.items()
+    }
+    return replace(case.recording, **signals)
 
 
 def turned(seed, duration=60.0, reach=np.pi, rate=50.0, noise=0.15, gyroscope_noise=2e-3, disturbed=None, axes=None):

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from magnetic_motion import PERFECT, turned
+from magnetic_motion import PERFECT, bent, turned
 from scipy.spatial.transform import Rotation
 
 from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetometer, compensate, load_calibration
@@ -521,27 +521,18 @@ def test_nothing_is_named_where_nothing_is(affected):
     assert not asked.causes and asked.p_value > 0.05 and asked.document()["verdict"] == "adequate"
 
 
-def bent(case, seed):
-    """The log of an uncalibrated IMU: per cents of scale and misalignment, as its data sheet allows."""
-    gyroscope, accelerometer = np.eye(3) + 0.01 * np.random.default_rng(seed).standard_normal((2, 3, 3))
-    gains = {"gyroscope": gyroscope, "accelerometer": np.tril(accelerometer)}
-    signals = {
-        name: replace(case.recording.signals[name], values=case.recording.signals[name].values @ gain.T)
-        for name, gain in gains.items()
-    }
-    return MagneticLog(case.magnetometer, replace(case.recording, **signals))
-
-
 def test_errors_that_data_sheets_allow_are_in_the_intervals(cases):
     """The gyroscope's errors turn the magnetometer's axes: they were three standard deviations off."""
-    fits = [calibrate_magnetometer([bent(case, seed)], FieldStrength(48.0))[0] for seed, case in enumerate(cases[:3])]
+    logs = [MagneticLog(case.magnetometer, bent(case, seed)) for seed, case in enumerate(cases[:3])]
+    fits = [calibrate_magnetometer([log], FieldStrength(48.0))[0] for log in logs]
     errors = np.array([off(calibration, case) for calibration, case in zip(fits, cases, strict=False)])
     assert 0.5 < np.sqrt(np.mean(errors**2)) < 1.5, errors
 
 
 def test_an_effect_that_cuts_no_error_is_not_named():
     """Per cents of scale of an IMU taken from its data sheet: parts left out gain nats by a step, and no error."""
-    log = bent(turned(2, reach=0.35), 2)
+    case = turned(2, reach=0.35)
+    log = MagneticLog(case.magnetometer, bent(case, 2))
     asked = diagnose_magnetometer(*calibrate_magnetometer([log], FieldStrength(48.0))[:2])
     assert not asked.causes and "no better" in asked.not_asked["mag.hard_iron_step"]
 

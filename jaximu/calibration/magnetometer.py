@@ -333,7 +333,7 @@ def _uncertain_turns(unit: Imu, base: Calibration | None) -> FloatArray:
     """Return by what share (k, 3, 3) of itself the rate may be off, one standard deviation each, as calibrated or by a
     data sheet.
     """
-    if base is None:
+    if base is None or base.imu.gyroscope is None:
         return _SHEET_GAIN * np.eye(9).reshape(9, 3, 3)
     known = base.of_numbers(lambda name: (name.owner, name.part) == ("gyroscope", "gain"))
     values, vectors = np.linalg.eigh(known.covariance)
