@@ -25,7 +25,7 @@ from jaximu.diagnosis.experiment import Experiment, KnownEffect, State
 from jaximu.diagnosis.extension import Extension, Found, extend, settled
 from jaximu.diagnosis.hidden import Hidden, hidden_causes
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
-from jaximu.diagnosis.learned import LearnedTerm, learn, left_out_likelihood
+from jaximu.diagnosis.learned import LearnedTerm, learn, left_out_likelihood, promising
 from jaximu.diagnosis.lines import MovingLine, line_findings, moving_lines, swings_of
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise, usual_noise
 from jaximu.diagnosis.selection import Selection, select, shape_of
@@ -767,19 +767,22 @@ class _Course:
         if self.extension.complete:
             return
         shape = shape_of(base.evidence, self.examination.level)
-        learned = learn(experiment, state if self.chosen else base, self.other, self.examination.level)
-        if shape is not None and learned is not None and shape[1] > learned.gain.log_likelihood:
-            alike = learned.drift and shape[0].curved in learned.effect.needs
-            learned = learned if alike else None  # it would only imitate the shape
-        if learned is not None and self.extension.found and not self.chosen:
-            beside = learn(experiment, state, self.other)
+        candidate = promising(experiment, state if self.chosen else base)
+        imitated = shape if shape and candidate and shape[1] > candidate.gain.log_likelihood else None
+        guessed = False
+        if candidate is not None and self.extension.found and not self.chosen:
+            beside = promising(experiment, state)
             predicted = left_out_likelihood(experiment, state) if beside is None else beside.log_likelihood
             inputs = {CATALOGUE[entry.name].curved() for entry in self.extension.found} - {""}
             one_curve = beside is not None and beside.effect.curved() in inputs  # and not two of the same input
-            if predicted > learned.log_likelihood + _GUESSED and not one_curve:
-                learned = beside
-            else:  # what was named in part was a guess at the same misfit
-                self._settle(found=[])
+            # what was named in part was a guess at the same misfit, or the curve is of what it leaves
+            guessed = one_curve or predicted <= candidate.log_likelihood + _GUESSED
+            candidate = candidate if guessed else beside
+        learned = candidate and learn(experiment, candidate, self.other, self.examination.level)
+        if imitated and learned and not (learned.drift and imitated[0].curved in learned.effect.needs):
+            learned = None
+        if guessed and learned:
+            self._settle(found=[])
         if learned is not None and learned.drift:
             self._drifts(learned)
         elif learned is not None:

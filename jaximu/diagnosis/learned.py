@@ -44,8 +44,8 @@ class LearnedTerm:
     effect: the curve. gain: on data that was not fitted; where that is parts of the recording left out, the noise of
     either model is widened to fit what was left out, if it looks too small. x (101,): the covariate, in its unit; y
     (101, 3): what the axes of the triad put out by it, SI; half_width (101, 3): of its 95 % band. state: the fit with
-    the curve in it. log_likelihood: of all parts of the recording left out in turn. drift: whether it is a cause: the
-    curve belongs to the recording, makes errors left out smaller, and leaves nothing unexplained.
+    the curve in it. drift: whether it is a cause: the curve belongs to the recording, makes errors left out smaller,
+    and leaves nothing unexplained.
     """
 
     effect: Curve
@@ -54,7 +54,6 @@ class LearnedTerm:
     y: FloatArray
     half_width: FloatArray
     state: State
-    log_likelihood: float
     drift: bool = False
 
     @property
@@ -93,39 +92,63 @@ class LearnedTerm:
         }
 
 
-def learn(
-    experiment: Experiment, state: State, held: Experiment | None = None, level: float = LEVEL
-) -> LearnedTerm | None:
-    """Return the smooth term of one covariate, on one triad, that predicts best what was left out; None if none pays.
+@dataclass(frozen=True)
+class Candidate:
+    """A curve that predicts what is left out better than a fit without it does; it is not fitted yet.
 
-    **Arguments:** `state`: a fit that leaves something unexplained; `held`: another recording of the unit, on which
-    the gain is measured (and must be one) where the curve belongs to the unit; `level`: of what a curve leaves.
+    state: that fit. effect: the dormant curve. spread (q,): what its coefficients are a priori. gain: on parts left
+    out.
+    """
+
+    state: State
+    effect: Curve
+    spread: FloatArray
+    gain: Gain
+
+    @property
+    def log_likelihood(self) -> float:
+        """Of all parts of the recording left out in turn, nats."""
+        return (self.gain.otherwise or self.gain).after.log_likelihood
+
+
+def promising(experiment: Experiment, state: State) -> Candidate | None:
+    """Return the smooth curve of one covariate, on one triad, that predicts best what was left out; None if none pays.
+
+    **Arguments:** `state`: a fit that leaves something unexplained.
     """
     for interleaved in (False, True):
         best = _best(experiment, state, interleaved)
-        if best is not None and best[2].log_likelihood > (0 if interleaved else _PAYS):
-            break
-    else:
-        return None
-    effect, spread, gain = best
+        if best is not None and best.gain.log_likelihood > (0 if interleaved else _PAYS):
+            return best
+    return None
+
+
+def learn(
+    experiment: Experiment, candidate: Candidate, held: Experiment | None = None, level: float = LEVEL
+) -> LearnedTerm | None:
+    """Return a curve as it is fitted; None where it does not pay after all.
+
+    **Arguments:** `held`: another recording of the unit, on which the gain is measured (and must be one) where the
+    curve belongs to the unit; `level`: of what a curve leaves.
+    """
+    effect, gain = candidate.effect, candidate.gain
     try:
-        fitted = _fitted(experiment, state, effect, spread)
+        fitted = _fitted(experiment, candidate)
     except NotPossibleError:  # a curve that leads a fit to nothing explains nothing
         return None
-    gained, alone = gain.log_likelihood, (gain.otherwise or gain).after.log_likelihood
     if held is not None and effect.scope == "device":
-        gain = on_held_out(held, state, fitted)
+        gain = on_held_out(held, candidate.state, fitted)
         if gain.log_likelihood <= 0:
             return None
-    before, after = (select(fit.evidence, level).explained for fit in (state, fitted))
+    before, after = (select(fit.evidence, level).explained for fit in (candidate.state, fitted))
     drift = effect.scope == "session" and gain.smaller([effect]) and after and not before
-    if gained < _PAYS and not drift:
+    if candidate.gain.log_likelihood < _PAYS and not drift:
         return None
-    return LearnedTerm(curve_of(fitted), gain, *_curve(fitted), fitted, alone, drift)
+    return LearnedTerm(curve_of(fitted), gain, *_curve(fitted), fitted, drift)
 
 
-def _best(experiment: Experiment, state: State, interleaved: bool) -> tuple[Curve, FloatArray, Gain] | None:
-    """Return the curve that predicts best what is left out, what its coefficients are a priori (q,), and its gain.
+def _best(experiment: Experiment, state: State, interleaved: bool) -> Candidate | None:
+    """Return the curve that predicts best what is left out.
 
     Where that is `interleaved`, only curves that belong to the recording are asked: all others are used beyond it.
     None where there is none, or one that is to be asked in the other way.
@@ -150,7 +173,7 @@ def _best(experiment: Experiment, state: State, interleaved: bool) -> tuple[Curv
         return None
     effect, spread, columns, gained = best
     both = interleaved and parts[False].parts
-    return effect, spread, replace(gained, otherwise=gain(columns, False) if both else None)
+    return Candidate(state, effect, spread, replace(gained, otherwise=gain(columns, False) if both else None))
 
 
 def left_out_likelihood(experiment: Experiment, state: State) -> float:
@@ -262,13 +285,14 @@ class _Parts:
         return Prediction(self.experiment.real.rms(errors), squared / unit, count, likelihood)
 
 
-def _fitted(experiment: Experiment, state: State, effect: Curve, spread: FloatArray) -> State:
-    """Fit all parameters and the curve, its coefficients (q,) a priori of the standard deviations `spread`."""
+def _fitted(experiment: Experiment, candidate: Candidate) -> State:
+    """Fit all parameters and the curve, of whose coefficients it is known what they are a priori."""
+    state, effect = candidate.state, candidate.effect
     effects = (*state.effects, effect)
     owned = state.imu.with_effects(*effects).all_effects()
     ((owner, index),) = (key for key, fitted in owned.items() if fitted.name == effect.name)
     names = tuple(Name(owner, "coefficients", (k,), index) for k in range(effect.size))
-    return experiment.fit(effects, state.imu, Prior(names, np.zeros(effect.size), np.diag(1 / spread)))
+    return experiment.fit(effects, state.imu, Prior(names, np.zeros(effect.size), np.diag(1 / candidate.spread)))
 
 
 def curve_of(state: State) -> Curve:
