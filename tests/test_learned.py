@@ -15,7 +15,7 @@ from jaximu.cli.app import main
 from jaximu.cli.diagnose import give_diagnosis
 from jaximu.cli.options import Results
 from jaximu.diagnosis import diagnose
-from jaximu.diagnosis.learned import promising
+from jaximu.diagnosis.learned import learn, promising
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import SHAPES, SPLINES, Learned, splines
 from jaximu.model.sensor import Triad
@@ -210,4 +210,5 @@ def test_nothing_hidden_nothing_learned(clean):
     assert clean.learned is None
     assert clean.document()["learned"] is None
     # nor would it be, were it asked
-    assert promising(clean.experiment, clean.base) is None
+    candidate = promising(clean.experiment, clean.base)
+    assert candidate is None or learn(clean.experiment, candidate) is None

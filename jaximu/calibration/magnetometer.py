@@ -824,7 +824,7 @@ def _dip(windows: FieldWindows, fit: Fit) -> tuple[float | None, float]:
     dip = float(np.arcsin(np.clip(middle, -1, 1)))
     spread = robust_sigma(sine - middle) / np.sqrt(max(calm.sum() / 4, 1))  # neighbours share their errors
     bent = windows.bent(field)[calm].mean(axis=0)
-    return dip, float(np.hypot(spread, np.sqrt(bent @ windows.vertical @ bent)) / max(np.cos(dip), 0.05))
+    return dip, float(np.hypot(spread, root_or_zero(bent @ windows.vertical @ bent)) / max(np.cos(dip), 0.05))
 
 
 def heading_errors(calibration: Calibration, start: Imu, strength: float, dip: float) -> Heading:
