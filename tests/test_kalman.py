@@ -35,7 +35,7 @@ from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
 from jaximu.recordings.recording import Signal
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
-from jaximu.simulation.protocols import Environment, HandHeld, Positions, Rotations, SingleAxisTable
+from jaximu.simulation.protocols import Environment, HandHeld, Rotations, SingleAxisTable
 from jaximu.simulation.protocols.base import Protocol
 from jaximu.simulation.protocols.course import Course
 
@@ -133,14 +133,13 @@ PROTOCOLS = {
     "hand-held": HandHeld(poses=7, pose_duration=2.5, turn_duration=1.4),
     "tracked": HandHeld(poses=7, pose_duration=2.5, turn_duration=1.4, displacement=0.4),
     "magnetic": HandHeld(poses=7, pose_duration=2.5, turn_duration=1.4),
-    "positions": Positions(12, 1.5, 1.4),
     "single-axis-table": SingleAxisTable(1.5, 180.0, 1.4),
 }
 
 
 @pytest.mark.parametrize(
     ("protocol", "grade", "drifts"),
-    [*((protocol, 1.0, 2) for protocol in PROTOCOLS), ("hand-held", 0.01, 0), ("single-axis-table", 0.01, 0)],
+    [("hand-held", 0.01, 0), ("tracked", 1.0, 2), ("magnetic", 1.0, 2), ("single-axis-table", 1.0, 2)],
 )
 def test_the_fit_is_the_least_squares_solution_of_all_states_and_numbers(protocol, grade, drifts):
     """Numbers, iterated to convergence, against dense Gauss–Newton steps over every state at once."""
@@ -252,20 +251,25 @@ def test_the_filter_recovers_a_simulated_unit(recorded, calibrated):
 def test_a_sequence_that_leaves_too_much_open_is_refused_with_what_to_record():
     """All turns about z are about the vertical in nineteen positions, and such a gyroscope does not feel the Earth."""
     imu = draw_imu(2)
-    recording, _ = simulate(imu, Rotations(duration=4.0), consumer_noise(), rate=50.0, seed=2)
+    recording, _ = simulate(imu, Rotations(duration=2.5, turn_duration=1.4), consumer_noise(), rate=50.0, seed=2)
     with pytest.raises(NotPossibleError, match=r"Gyroscope scale z .* axis horizontal.*jaximu plan"):
         calibrate_by_filter(recording, LocalGravity(9.80665, 1e-3))
 
 
+HIDDEN = {
+    "accel.size_effect": np.array([0.03, -0.02, 0.01, -0.01, 0.02, 0.03, -0.02, 0.0, -0.04]),
+    "accel.quadratic": np.array([4e-4, -6e-4, 8e-4]),
+    "setup.time_offset": np.array([3e-3]),
+}
+
+
 def test_effects_that_only_motion_shows_are_found_as_states():
-    hidden = {"accel.size_effect": np.array([0.03, -0.02, 0.01, -0.01, 0.02, 0.03, -0.02, 0.0, -0.04]),
-              "accel.quadratic": np.array([4e-4, -6e-4, 8e-4]), "setup.time_offset": np.array([3e-3])}  # fmt: skip
-    imu = draw_imu(5).with_effects(*(CATALOGUE[name].make(each) for name, each in hidden.items()))
+    imu = draw_imu(5).with_effects(*(CATALOGUE[name].make(each) for name, each in HIDDEN.items()))
     protocol = HandHeld(poses=12, pose_duration=2.5, turn_duration=1.4)
     recording, _ = simulate(imu, protocol, consumer_noise(), rate=50.0, seed=5)
-    found, history = calibrate_by_filter(recording, GRAVITY, static=NOISE, effects=tuple(hidden))
+    found, history = calibrate_by_filter(recording, GRAVITY, static=NOISE, effects=tuple(HIDDEN))
     effects = {each.name: np.asarray(each.coefficients) for each in found.imu.all_effects().values()}
-    for name, truth in hidden.items():
+    for name, truth in HIDDEN.items():
         rows = list(places_of(CATALOGUE[name], found.imu, found.names))
         covariance, error = found.covariance[np.ix_(rows, rows)], effects[name] - truth
         assert error @ np.linalg.solve(covariance, error) < 4 * len(rows) + 5
@@ -285,7 +289,7 @@ def test_effects_that_the_filter_cannot_follow_are_refused(recorded):
             calibrate_by_filter(recorded[1], GRAVITY, effects=[name])
     loud = NoiseModel(AxisNoise.of_white((300 * ACCELEROMETER_DENSITY) ** 2), AxisNoise.of_white(GYROSCOPE_DENSITY**2))
     with pytest.raises(NotPossibleError, match=r"size effect .* hidden in the noise"):
-        calibrate_by_filter(recorded[1], GRAVITY, static=loud, effects=["accel.size_effect"])
+        calibrate_by_filter(recorded[1], GRAVITY, static=loud, effects=tuple(HIDDEN))
 
 
 def test_in_use_the_same_unit_is_followed_and_another_is_told(recorded, calibrated):
@@ -294,7 +298,8 @@ def test_in_use_the_same_unit_is_followed_and_another_is_told(recorded, calibrat
     assert after.filter["diverged"] is None
     assert 0.7 < after.filter["nis"] < 1.3
     assert history.sigmas[-1, 0] < history.sigmas[0, 0]
-    other = simulate(draw_imu(6), HandHeld(poses=5, pose_duration=3.0), consumer_noise(), rate=50.0, seed=6)[0]
+    protocol = HandHeld(poses=12, pose_duration=2.5, turn_duration=1.4)
+    other = simulate(draw_imu(6), protocol, consumer_noise(), rate=50.0, seed=6)[0]
     told, _ = followed_in_use(calibration, other, NOISE)
     assert told.filter["diverged"] is not None and "another unit" in told.filter["diverged"]
 
@@ -356,8 +361,8 @@ def test_a_recording_without_gyroscope_is_refused(recorded):
     with pytest.raises(InputError, match="needs a gyroscope"):
         calibrate_by_filter(replace(recorded[1], gyroscope=None), GRAVITY)
     with pytest.raises(NotPossibleError, match="static pose"):
-        still = simulate(recorded[0], HandHeld(poses=1, pose_duration=30.0), consumer_noise(), rate=50.0, seed=1)[0]
-        calibrate_by_filter(still, GRAVITY)
+        still = recorded[1].gyroscope.time < recorded[2][0, 1]
+        calibrate_by_filter(with_rates(recorded[1], recorded[1].gyroscope.values, still), GRAVITY)
 
 
 # --- a measured attitude ----------------------------------------------------------------------------------------------
