@@ -454,7 +454,7 @@ class Draw:
         return output
 
     def tried(self, line: list[str], file: str | None = None, only_with_output: bool = False) -> None:
-        """Run the verb plain, with --json and with -o, and compare them."""
+        """Run the verb plain, with --json and with -o, and compare them; plain only if logs need not be short."""
         verb, output = line[0], self.folder / "out"
         self.last = line
         ways = [("plain", None, False), ("--json", None, True), ("-o", output, False)]
@@ -464,6 +464,8 @@ class Draw:
             ways = [way for way in ways if not way[2]]
         if verb in every_verb.WITHOUT_OUTPUT:
             ways = [way for way in ways if way[1] is None]
+        if self.short and any(way[1] for way in ways):  # what prints the same and writes it, too, is enough
+            ways = [way for way in ways if way[1] or way[2]]
         outcomes = {name: self._run(name, line, folder, as_json, file) for name, folder, as_json in ways}
         if len({outcome.status for outcome in outcomes.values()}) > 1:
             said = ", ".join(f"{name} {outcome.status} ({outcome.short[:80]})" for name, outcome in outcomes.items())
