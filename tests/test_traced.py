@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from jax.flatten_util import ravel_pytree
 from synthetic import GRAVITY, POSES, SAMPLES, recording, simulated
 from whitened_by_hand import gravity_direction, static_gyroscope
 
@@ -15,7 +16,7 @@ import jaximu
 from jaximu.data.gravity_norm import gravity_norm
 from jaximu.data.poses import PosesAndTurns, condense
 from jaximu.data.poses_covariance import turned_by
-from jaximu.estimation.problem import Name, without_equipment
+from jaximu.estimation.problem import Name
 from jaximu.estimation.projection import output_error, sensitivity
 from jaximu.estimation.track import Recorded
 from jaximu.model.effects import CATALOGUE
@@ -53,13 +54,16 @@ def hosts(data):
 
 
 @pytest.fixture(scope="module")
-def batched():
-    """Return a compiled fit of many units side by side."""
-    return jax.jit(jax.vmap(lambda data: jaximu.fit(NOMINAL, data)))
+def batched(data):
+    """Return fits of the three, of one that is not finite, and of one of three poses, compiled side by side with the
+    units that they start from."""
+    spoilt = eqx.tree_at(lambda d: d.poses.accelerometer_mean, data[1], np.full((POSES, 3), np.nan))
+    start = jax.tree.map(lambda leaf: np.stack([leaf] * 5), NOMINAL)
+    return jax.jit(jax.vmap(jaximu.fit))(start, jaximu.stack([*data, spoilt, data_of(33, poses=3)]))
 
 
-def test_a_fit_can_be_compiled_with_what_it_starts_from(data, hosts):
-    fit = jax.jit(jaximu.fit)(NOMINAL, data[0])
+def test_a_fit_can_be_compiled_with_what_it_starts_from(hosts, batched):
+    fit = jax.tree.map(lambda leaf: leaf[0], batched)
     assert off(fit, hosts[0]) < 1e-9
     np.testing.assert_allclose(fit.excess, hosts[0].excess, rtol=1e-9, atol=1e-12)
     assert float(np.max(np.abs(fit.covariance / hosts[0].covariance - 1))) < 1e-2  # taken anew where the fit ended
@@ -68,11 +72,9 @@ def test_a_fit_can_be_compiled_with_what_it_starts_from(data, hosts):
     assert fit.imu.accelerometer.gain.shape == (3, 3)
 
 
-def test_units_side_by_side_are_what_each_is_alone(data, hosts, batched):
+def test_units_side_by_side_are_what_each_is_alone(hosts, batched):
     """One that is not finite, and one of three poses, leave the others as they are."""
-    spoilt = eqx.tree_at(lambda d: d.poses.accelerometer_mean, data[1], np.full((POSES, 3), np.nan))
-    few = data_of(33, poses=3)
-    fits = batched(jaximu.stack([*data, spoilt, few]))
+    fits = batched
     assert max(off(jax.tree.map(lambda leaf, k=k: leaf[k], fits), hosts[k]) for k in range(3)) < 1e-9
     assert fits.converged.tolist()[:3] == [True, True, True]
     assert fits.finite.tolist() == [True, True, True, False, True]
@@ -81,13 +83,7 @@ def test_units_side_by_side_are_what_each_is_alone(data, hosts, batched):
     assert fits.sigmas()[4].max() > 100 * fits.sigmas()[0].max()  # three poses tell little, and it says so
 
 
-def test_a_leading_axis_on_the_host_is_the_same(data, hosts):
-    three = jax.tree.map(lambda leaf: np.stack([leaf] * 3), NOMINAL)
-    fits = jaximu.fit(three, jaximu.stack(data))
-    assert max(off(jax.tree.map(lambda leaf, k=k: leaf[k], fits), hosts[k]) for k in range(3)) < 1e-9
-
-
-def test_derivatives_of_a_fit_are_right(data):
+def test_derivatives_of_a_fit_are_right(data, hosts):
     """By gravity, a pose's force and one sample of the gyroscope; reverse as forward."""
 
     def values(change):
@@ -100,14 +96,20 @@ def test_derivatives_of_a_fit_are_right(data):
         moved = eqx.tree_at(lambda d: (d.gravity, d.poses.accelerometer_mean, d.turns.output), data[0], fields)
         return jaximu.fit(NOMINAL, moved, excess=EXCESS, estimate_excess=False).values
 
-    none, compiled = jnp.zeros(3), jax.jit(values)
-    forward = jax.jit(jax.jacfwd(values))(none)
+    weights = np.random.default_rng(0).normal(size=len(hosts[0].values))
+
+    @jax.jit
+    def both_ways(change):
+        at, along = jax.linearize(values, change)
+        reverse = jax.linear_transpose(along, change)(jnp.asarray(weights))[0]
+        return at, jax.vmap(along, out_axes=1)(jnp.eye(3)), reverse
+
+    none = jnp.zeros(3)
+    _, forward, reverse = both_ways(none)
     for place, most in enumerate((1e-8, 1e-4, 1e-3)):
         step = none.at[place].set(1e-4)
-        slope = (compiled(step) - compiled(-step)) / 2e-4
+        slope = (both_ways(step)[0] - both_ways(-step)[0]) / 2e-4
         assert float(np.max(np.abs(forward[:, place] - slope)) / np.max(np.abs(slope))) < most
-    weights = np.random.default_rng(0).normal(size=len(forward))
-    reverse = jax.jit(jax.grad(lambda change: weights @ values(change)))(none)
     np.testing.assert_allclose(reverse, weights @ forward, rtol=1e-12)
 
 
@@ -116,14 +118,15 @@ def test_a_prior_can_be_differentiated(data, hosts):
     name, place = hosts[0].names[0], 0
     width = float(hosts[0].sigmas()[place])
 
+    @jax.jit
+    @jax.value_and_grad
     def value(mean):
         prior = jaximu.Prior((name,), mean[None], jnp.eye(1) / width)
         return jaximu.fit(NOMINAL, data[0], prior=prior, excess=EXCESS, estimate_excess=False).values[place]
 
     at = float(hosts[0].values[place])
-    slope = jax.jit(jax.grad(value))(at)
-    compiled = jax.jit(value)
-    assert slope == pytest.approx(float(compiled(at + width) - compiled(at - width)) / (2 * width), rel=1e-4)
+    slope = value(at)[1]
+    assert slope == pytest.approx(float(value(at + width)[0] - value(at - width)[0]) / (2 * width), rel=1e-4)
     assert 0.2 < slope < 0.9  # as much as it weighs beside the data
 
 
@@ -148,14 +151,18 @@ def test_what_a_user_writes_of_logs():
         jaximu.observe([logs[0], jaximu.Recording(logs[0].accelerometer)], GRAVITY)
 
 
-def test_free_numbers_can_be_chosen_under_a_trace(data):
-    def of_gyroscope(name: Name) -> bool:
-        return without_equipment(name) and name.owner == "gyroscope"
+def test_free_numbers_can_be_chosen_under_a_trace():
+    def bias(name: Name) -> bool:
+        return name.owner == "accelerometer" and name.part == "bias"
+
+    unit = replace(NOMINAL, accelerometer=replace(NOMINAL.accelerometer, bias=np.array([0.1, -0.2, 0.15])))
+    data = jaximu.observe(jaximu.Recording(recording(1, imu=unit)[0].accelerometer), GRAVITY)
 
     def fitted(excess):  # which alone is traced
-        return jaximu.fit(NOMINAL, data[0], of_gyroscope, excess=excess, estimate_excess=False)
+        return jaximu.fit(NOMINAL, data, bias, excess=excess, estimate_excess=False)
 
     host, traced = fitted(EXCESS), jax.jit(fitted)(EXCESS)
+    assert len(host.names) == 3
     assert off(traced, host) < 1e-9
     np.testing.assert_array_equal(traced.imu.accelerometer.gain, np.eye(3))
 
@@ -171,23 +178,33 @@ def test_effects_need_samples(data):
 
 @pytest.fixture(scope="module")
 def with_effects():
-    """Return a unit of two effects to be fitted, and the data of two logs of different length with their samples."""
+    """Return a unit of two effects to be fitted, and the data of three logs with their samples, which differ in length,
+    in rate, in whether vibration stands out, in whether both sensors share their stamps; the last log, too."""
     names = "accel.quadratic", "gyro.g_sensitivity"
     unit = NOMINAL.with_effects(*(jaximu.CATALOGUE[name].dormant() for name in names))
     logs = [recording(seed, poses=poses)[0] for seed, poses in ((1, 12), (2, 14))]
-    return jax.tree.map(np.asarray, unit), [jaximu.observe(log, GRAVITY, samples=True) for log in logs]
+    log, random = recording(3, poses=12, rates=(50.0, 80.0))[0], np.random.default_rng(3)
+    shaken = log.accelerometer.values + 0.3 * random.normal(size=(len(log.accelerometer), 1)) * np.array(
+        [0.5, 1.0, 0.2]
+    )
+    rests = segment(log).intervals
+    still = ((log.accelerometer.time[:, None] > rests[:, 0]) & (log.accelerometer.time[:, None] < rests[:, 1])).any(1)
+    values = np.where(still[:, None], log.accelerometer.values, shaken)
+    logs.append(replace(log, accelerometer=replace(log.accelerometer, values=values)))
+    return jax.tree.map(np.asarray, unit), [jaximu.observe(log, GRAVITY, samples=True) for log in logs], logs[-1]
 
 
 def test_effects_are_fitted_under_a_trace_and_side_by_side(with_effects):
     """As on the host, one unit alone; each effect's prior is felt, and the fit reacts to gravity as it says."""
-    unit, data = with_effects
+    unit, data, _ = with_effects
+    assert [each.samples[0].recorded.shaken is not None for each in data] == [False, False, True]
     alone = [jaximu.fit(unit, each) for each in data]
     many = jaximu.stack(data)
     traced = jax.jit(jax.vmap(lambda each: jaximu.fit(unit, each)))(many)
-    together = jaximu.fit(jax.tree.map(lambda leaf: np.stack([leaf] * 2), unit), many)
+    together = jaximu.fit(jax.tree.map(lambda leaf: np.stack([leaf] * 3), unit), many)
     for fits in (traced, together):
         assert fits.converged.all()
-        assert max(off(jax.tree.map(lambda leaf, k=k: leaf[k], fits), alone[k]) for k in range(2)) < 1e-9
+        assert max(off(jax.tree.map(lambda leaf, k=k: leaf[k], fits), alone[k]) for k in range(3)) < 1e-9
 
     place = next(k for k, name in enumerate(alone[0].names) if name.part == "coefficients")
     width = float(alone[0].sigmas()[place])
@@ -204,30 +221,16 @@ def test_effects_are_fitted_under_a_trace_and_side_by_side(with_effects):
     assert 0.2 < forward[place] / width < 0.9
 
 
-def test_units_whose_logs_differ_are_fitted_side_by_side(with_effects):
-    """In length, in rate, in whether vibration stands out, in whether both sensors share their stamps."""
-    unit, data = with_effects
-    log, random = recording(3, poses=12, rates=(50.0, 80.0))[0], np.random.default_rng(3)
-    shaken = log.accelerometer.values + 0.3 * random.normal(size=(len(log.accelerometer), 1)) * np.array(
-        [0.5, 1.0, 0.2]
-    )
-    rests = segment(log).intervals
-    still = ((log.accelerometer.time[:, None] > rests[:, 0]) & (log.accelerometer.time[:, None] < rests[:, 1])).any(1)
-    values = np.where(still[:, None], log.accelerometer.values, shaken)
-    shaking = replace(log, accelerometer=replace(log.accelerometer, values=values))
-    data = [data[0], jaximu.observe(shaking, GRAVITY, samples=True)]
-    assert [each.samples[0].recorded.shaken is not None for each in data] == [False, True]
-    alone = [jaximu.fit(unit, each) for each in data]
-    fits = jax.jit(jax.vmap(lambda each: jaximu.fit(unit, each)))(jaximu.stack(data))
-    assert max(off(jax.tree.map(lambda leaf, k=k: leaf[k], fits), alone[k]) for k in range(2)) < 1e-9
+def test_what_shakes_one_of_two_units_is_told_of_that_one(with_effects):
+    _, (still, _, shaken), log = with_effects
     rectified = NOMINAL.with_effects(jaximu.CATALOGUE["accel.vibration_rectification"].dormant())
     with pytest.raises(jaximu.InputError, match="vibration"):
-        jaximu.fit(rectified, data[0])
-    both = jax.jit(jax.vmap(lambda each: jaximu.fit(rectified, each)))(jaximu.stack(data))
+        jaximu.fit(rectified, still)
+    both = jaximu.fit(jax.tree.map(lambda leaf: np.stack([leaf] * 2), rectified), jaximu.stack([still, shaken]))
     place = next(k for k, name in enumerate(both.names) if name.part == "coefficients")
     assert both.sigmas()[0, place] > 10 * both.sigmas()[1, place]  # nothing shook the first
     with pytest.raises(jaximu.InputError, match="number of recordings"):
-        jaximu.stack([data[0], jaximu.observe([log, shaking], GRAVITY, samples=True)])
+        jaximu.stack([still, jaximu.observe([log, log], GRAVITY, samples=True)])
 
 
 def test_vibration_is_the_mean_square_over_a_window():
@@ -246,7 +249,7 @@ def test_vibration_is_the_mean_square_over_a_window():
 
 def test_residuals_take_what_effects_need(with_effects):
     """Given the stimulus they take off what effects add, and without it say what is missing."""
-    _, data = with_effects
+    _, data, _ = with_effects
     effects = (
         jaximu.CATALOGUE["accel.warm_up"].make(0.1, time_constant=30.0),
         jaximu.CATALOGUE["gyro.warm_up"].make(1e-3, time_constant=30.0),
@@ -334,12 +337,11 @@ def test_what_is_host_by_nature_says_so():
         jax.jit(simulated_output)(jnp.zeros(3))
 
 
-@pytest.mark.parametrize("solver", [optx.Dogleg, optx.LevenbergMarquardt], ids=lambda solver: solver.__name__)
-def test_any_least_squares_solver_of_optimistix_ends_where_ours_does(solver, data, hosts):
-    fit = jaximu.fit(NOMINAL, data[0], solver=solver(rtol=1e-9, atol=1e-9))
+def test_any_least_squares_solver_of_optimistix_ends_where_ours_does(data, hosts):
+    fit = jaximu.fit(NOMINAL, data[0], solver=optx.Dogleg(rtol=1e-9, atol=1e-9))
     assert fit.converged
     assert off(fit, hosts[0]) < 1e-6
-    assert int(fit.steps) != int(hosts[0].steps) or solver is optx.LevenbergMarquardt
+    assert int(fit.steps) != int(hosts[0].steps)
 
 
 def test_a_solver_that_does_not_converge_says_so(data):
@@ -376,8 +378,7 @@ def _whitened(imu, data):
 
 
 TRACEABLE = {
-    "Imu.respond": lambda imu, data: imu.respond(_STIMULUS),
-    "Imu.respond with effects": lambda imu, data: imu.with_effects(*_EFFECTS).respond(_STIMULUS),
+    "Imu.respond": lambda imu, data: imu.with_effects(*_EFFECTS).respond(_STIMULUS),
     "Imu.recover": lambda imu, data: imu.recover(data.poses.accelerometer_mean, data.poses.gyroscope_mean),
     "Imu.recover with effects": lambda imu, data: imu.with_effects(*_EFFECTS).recover(*_OUTPUTS, _STIMULUS),
     "sensitivity": lambda imu, data: sensitivity(imu, np.arange(24), _STIMULUS),
@@ -386,45 +387,44 @@ TRACEABLE = {
     "gravity_direction": _direction,
     "static_gyroscope": lambda imu, data: static_gyroscope(imu, data, jnp.ones((len(data.poses.mask), 3, 3))),
     "turned_by": lambda imu, data: turned_by(imu.gyroscope, data.turns),
-    "conditions": lambda imu, data: condense(imu, data)[0](imu),
-    "covariance": lambda imu, data: condense(imu, data)[1],
     "whitening": _whitened,
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", TRACEABLE)
-def test_every_piece_of_the_way_is_compiled_batched_and_differentiated(name, data):
-    def numbers(imu):
-        leaves = jax.tree.leaves(
-            eqx.filter(TRACEABLE[name](imu, jax.tree.map(jnp.asarray, data[2])), eqx.is_inexact_array)
-        )
-        return jnp.concatenate([jnp.ravel(leaf) for leaf in leaves])
+def test_every_piece_of_the_way_is_compiled_batched_and_differentiated(data):
+    few = jax.tree.map(jnp.asarray, data[2])
+
+    def numbers(name):
+        """Return a piece as a function of a unit that gives all its numbers in a row."""
+        return lambda imu: ravel_pytree(eqx.filter(TRACEABLE[name](imu, few), eqx.is_inexact_array))[0]
 
     units = [jax.tree.map(jnp.asarray, simulated(seed).imu) for seed in (30, 31)]
     random = np.random.default_rng(41)
     direction = jax.tree.map(lambda leaf: jnp.asarray(random.normal(size=leaf.shape)), units[0])
     units += [jax.tree.map(lambda a, b, step=step: a + step * b, units[0], direction) for step in (1e-5, -1e-5)]
-    expected = [np.asarray(numbers(unit)) for unit in units[:2]]
-    scale = np.abs(expected[0]).max()
-    assert np.all(np.isfinite(expected))
-    assert np.abs(expected[0] - expected[1]).max() > 1e-9 * scale
-    many = jax.jit(jax.vmap(numbers))(jax.tree.map(lambda *leaves: jnp.stack(leaves), *units))
-    np.testing.assert_allclose(many[:2], expected, atol=1e-11 * scale)
-    share = jnp.asarray(random.normal(size=len(expected[0]))) / scale
+    expected = {name: np.stack([numbers(name)(unit) for unit in units[:2]]) for name in TRACEABLE}
+    scale = {name: np.abs(each[0]).max() for name, each in expected.items()}
+    share = {name: jnp.asarray(random.normal(size=each.shape[1])) / scale[name] for name, each in expected.items()}
 
     @jax.jit
+    @jax.vmap
     def both_ways(unit):
-        """All numbers, and how a sum of them changes along a direction: forward, and by the gradient."""
-        changed = jax.jvp(numbers, (unit,), (direction,))
-        gradient = jax.grad(lambda moved: share @ numbers(moved))(unit)
-        parts = jax.tree.map(lambda a, b: jnp.sum(a * b), gradient, direction)
-        return changed[0], share @ changed[1], sum(jax.tree.leaves(parts))
+        """By piece all numbers, and how a sum of them changes along a direction: forward, and by the gradient."""
+        ways = {}
+        for name, part in share.items():
+            found, change = jax.jvp(numbers(name), (unit,), (direction,))
+            gradient = jax.vjp(numbers(name), unit)[1](part)[0]
+            ways[name] = found, part @ change, ravel_pytree(gradient)[0] @ ravel_pytree(direction)[0]
+        return ways
 
-    found, forward, reverse = both_ways(units[0])
-    np.testing.assert_allclose(found, expected[0], atol=1e-11 * scale)
-    assert float(reverse) == pytest.approx(float(forward), rel=1e-10, abs=1e-12)
-    difference = float(share @ (many[2] - many[3])) / 2e-5
-    assert float(forward) == pytest.approx(difference, rel=1e-5, abs=1e-7)
+    for name, (found, forward, reverse) in both_ways(jax.tree.map(lambda *leaves: jnp.stack(leaves), *units)).items():
+        wanted = expected[name]
+        assert np.all(np.isfinite(wanted)), name
+        assert np.abs(wanted[0] - wanted[1]).max() > 1e-9 * scale[name], name
+        np.testing.assert_allclose(found[:2], wanted, atol=1e-11 * scale[name], err_msg=name)
+        np.testing.assert_allclose(reverse, forward, rtol=1e-10, atol=1e-12, err_msg=name)
+        difference = float(share[name] @ (found[2] - found[3])) / 2e-5
+        assert float(forward[0]) == pytest.approx(difference, rel=1e-5, abs=1e-7), name
 
 
 def test_data_move_with_the_samples():
