@@ -92,7 +92,7 @@ def judge(units: Units, limits: Limits) -> Judged:
     outputs = [limit for limit in limits.limits if limit.part in OUTPUTS and limit.owner in held]
     measured = measure(units, limits.nominal, outputs)
     first = len(measured.names) - 3 * len(outputs)
-    questions: list[tuple[Limit, str, int]] = []
+    questions = []
     named = {(limit.owner, limit.part, limit.axes) for limit in limits.limits}
     for limit in limits.limits:
         if limit.part in OF_ONE_UNIT:

@@ -168,7 +168,7 @@ def _temperatures(calibrations: Sequence[Calibration], files: Sequence[str]) -> 
 
 def _at_temperatures(calibration: Calibration, common: Mapping[str, float]) -> tuple[Calibration, dict[str, str]]:
     """Return a calibration whose biases are those at steady temperatures, and what is not compared because of it."""
-    reasons: dict[str, str] = {}
+    reasons = {}
     for owner, celsius in common.items():
         triad = calibration.triads().get(owner)
         if triad is None or triad.temperature_reference == celsius:
@@ -206,7 +206,7 @@ def _at_temperatures(calibration: Calibration, common: Mapping[str, float]) -> t
 
 def require_apart(calibrations: Sequence[Calibration], files: Sequence[str]) -> None:
     """Raise `InputError` for a calibration given twice, `NotPossibleError` where two rest on one recording."""
-    hashes: dict[str, str] = {}
+    hashes = {}
     for calibration, file in zip(calibrations, files, strict=True):
         for recording in calibration.data.get("files", ()):
             sha256 = recording.get("sha256")

@@ -318,7 +318,7 @@ def _comparable(epochs: Sequence[Epoch]) -> tuple[list[str], list[str]]:
 def _not_compared(left_out: Mapping[str, str], names: Sequence[str]) -> list[str]:
     """Return what is left out in sentences, one for each reason; axes stand together where none is compared."""
     stems = {name.partition("[")[0] for name in names}
-    by_reason: dict[str, dict[str, None]] = {}
+    by_reason = {}
     for what, why in left_out.items():
         stem = what.partition("[")[0]
         by_reason.setdefault(why, {})[what if stem in stems else stem] = None
@@ -332,7 +332,7 @@ def _has_axes(effect: Effect | type[Effect]) -> bool:
 
 def _apart(first: Epoch, other: Epoch) -> dict[str, str]:
     """Return why triads, or their gains, of two calibrations are not of one kind."""
-    reasons: dict[str, str] = {}
+    reasons = {}
     triads, others = first.calibration.triads(), other.calibration.triads()
     readings = first.calibration.reading, other.calibration.reading
     for owner in triads.keys() & others.keys():

@@ -255,7 +255,7 @@ def read_table(path: FilePath) -> Batch:
         return tuple(text or "" for text in kept[column].to_pylist()) if known else ("",) * len(rows)
 
     triads = {short: SENSORS[short] for short in ("accel", "gyro")[: 1 + gyroscope]}
-    outputs: Json = {}
+    outputs = {}
     for short, owner in triads.items():
         output_units = sorted(set(words(f"{short}_unit")))
         if len(output_units) > 1:

@@ -86,7 +86,7 @@ def of_calibration(calibration: Calibration) -> Units:
     data, excess = calibration.data, calibration.excess
     numbers = {owner: sum(name.owner == owner for name in names) for owner in SENSOR_QUANTITIES}
     poses, turns = data.get("poses"), data.get("turns")
-    counts: dict[tuple[str, str], tuple[str, float | None]] = {}
+    counts = {}
     if poses is not None:
         # by hand a pose tells the norm alone; a known pose tells all three axes
         by_pose = 1 if numbers["accelerometer"] <= 9 else 3

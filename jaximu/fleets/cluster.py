@@ -52,7 +52,7 @@ def compute(jobs: Sequence[Job], indices: Sequence[int], settings: Settings, wor
         FittingActor
     )
     left = iter(batches(indices, settings, workers))
-    running: dict[Any, tuple[Any, list[int]]] = {}
+    running = {}
 
     def give_work(actor: Any) -> None:
         if batch := next(left, None):

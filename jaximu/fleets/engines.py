@@ -12,7 +12,7 @@ import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 
@@ -41,7 +41,7 @@ def local(jobs: Sequence[Job], places: Sequence[int], settings: Settings, worker
 def _one_pool(jobs: Sequence[Job], waiting: deque, settings: Settings, workers: int) -> Iterator[Rows]:
     """Work until all is done, or a process dies; then what was being computed is put back."""
     alone = waiting[0][1] >= _TRIES  # suspects run one at a time, so that it is known which one it was
-    running: dict[Future, tuple[list[int], int]] = {}
+    running = {}
     with _quiet_threads(), _pool(1 if alone else workers) as pool:
         broken = False
         while running or (waiting and not broken):

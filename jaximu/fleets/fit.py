@@ -53,8 +53,8 @@ def fit_units(units: Sequence[FleetUnit]) -> list[tuple[Fit, FloatArray]]:
     **Returns:** of each unit its fit, and the rms (3,) of the norm of gravity (m/s²), of carried gravity (degrees) and
     of the rate at rest (rad/s), 0 where there is none. Failures do not raise: look at `converged` and `finite`.
     """
-    fits: dict[int, tuple[Fit, FloatArray]] = {}
-    groups: dict[tuple, list[tuple[int, PosesAndTurns]]] = {}
+    fits = {}
+    groups = {}
     for index, unit in enumerate(units):
         data = unit.alike()
         shapes = jax.tree.structure((unit.nominal, data)), *(np.shape(leaf) for leaf in jax.tree.leaves(data))

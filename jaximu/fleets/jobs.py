@@ -136,8 +136,8 @@ def find_jobs(
     manifest names none, or a folder of them, each called after its device. Raises `InputError` where nothing is found
     or a recording is named twice.
     """
-    named: list[Job] = []
-    loose: list[Path] = []
+    named = []
+    loose = []
     arguments = [os.fspath(argument) for argument in logs]
     if not arguments:
         raise InputError("no log was given: name logs, folders of logs, patterns in quotes, or a manifest.")
@@ -187,7 +187,7 @@ def _recordings_at_rest(static: FilePath | None) -> dict[str, Path]:
         return {_ALL: path}
     if not path.is_dir():
         raise InputError(f"--static {path}: no such file or folder.")
-    recordings: dict[str, Path] = {}
+    recordings = {}
     for log in logs_below(path):
         device = log.relative_to(path).with_suffix("").as_posix()
         if device in recordings:
@@ -222,7 +222,7 @@ def _devices(paths: Sequence[Path]) -> list[str]:
 
 
 def _refuse_repeated(jobs: Sequence[Job]) -> None:
-    by_path: dict[str, Job] = {}
+    by_path = {}
     for job in jobs:
         real = os.path.realpath(job.file)
         if real in by_path:
@@ -235,7 +235,7 @@ def _refuse_repeated(jobs: Sequence[Job]) -> None:
 def _with_copies(jobs: Sequence[Job]) -> list[Job]:
     """Return the jobs, those whose file has the bytes of an earlier one's marked; only files of one size are read."""
     sizes = Counter(_stamp(job.file)[0] for job in jobs)
-    first: dict[str, str] = {}
+    first = {}
     marked = []
     for job in jobs:
         size = _stamp(job.file)[0]

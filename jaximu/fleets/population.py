@@ -303,8 +303,8 @@ def read_fleet(table: FilePath) -> Fleet:
     path = Path(table)
     require_table(path, (*_COLUMNS, "gyro_unit"))
     statuses, verdicts, effects = Counter(), Counter(), Counter()
-    failed: dict[str, list[str]] = {}
-    reasons: dict[str, str] = {}
+    failed = {}
+    reasons = {}
     kinds, remarked = Counter(), 0  # with a gyroscope, or without
     with pq.ParquetFile(path) as file:
         for batch in file.iter_batches(batch_size=4096, columns=_SUMMED):
@@ -476,7 +476,7 @@ def _lots_and_dates(units: _Units) -> tuple[list[Difference], Shifts]:
     inside = estimate_population(units.names, within, units.covariances)
     limit = scipy.stats.chi2.isf(LEVEL / len(within), size)
     usual = inside.distances(within, units.covariances) <= limit
-    findings: dict[int, list[tuple[float, tuple[Name, float, float]]]] = {}
+    findings = {}
     for k, name in enumerate(units.names):
         weight = usual / (inside.covariance[k, k] + units.covariances[:, k, k])
         for cause, amount, sigma, p_value in _causes(groups, units.values[:, k], weight, size):
@@ -517,8 +517,8 @@ def _causes(
     def p_value(z: FloatArray, causes) -> FloatArray:
         return np.minimum(1.0, 2 * scipy.stats.t.sf(np.abs(z), freedom) * questions[causes])
 
-    taken: list[int] = []
-    given_up: list[int] = []
+    taken = []
+    given_up = []
     while True:
         design = np.stack([np.ones(len(values)), *map(groups.column, taken)])
         spread = np.linalg.inv((weight * design) @ design.T)
@@ -547,7 +547,7 @@ def _causes(
 
 def _repeated(units: _Units) -> list[Difference]:
     """Devices that were recorded again and are no longer what they were."""
-    indices_of: dict[str, list[int]] = {}
+    indices_of = {}
     for index, row in enumerate(units.rows):
         indices_of.setdefault(row["device"], []).append(index)
     repeated = {device: indices for device, indices in indices_of.items() if len(indices) > 1}

@@ -106,8 +106,8 @@ class Store:
     def rows(self) -> Iterator[list[Json]]:
         """Give all rows in the order of the jobs, some at a time; parts are opened when they are needed."""
         left = np.bincount(self._owner, minlength=len(self._parts))
-        opened: dict[int, dict[str, Json]] = {}
-        group: list[Json] = []
+        opened = {}
+        group = []
         for index, part in enumerate(self._owner.tolist()):
             if part not in opened:
                 opened[part] = {row.pop("key"): row for row in pq.read_table(self._parts[part]).to_pylist()}

@@ -62,7 +62,7 @@ def kind_of(name: Name, model: Imu) -> str:
 
 def _simplified(imu: Imu) -> dict[str, Imu]:
     """Return the unit without its misalignment, and without each of its effects, by what was left out."""
-    simplified: dict[str, Imu] = {}
+    simplified = {}
     for owner in INERTIAL_QUANTITIES:
         triad: Triad = getattr(imu, owner)
         straight = replace(triad, gain=np.diag(np.diagonal(triad.gain)))
@@ -128,7 +128,7 @@ class Consequences(Result, Document, page="consequences"):
         """Return which term's position error is the largest, from when to when (s)."""
         names = list(self.terms)
         first = np.argmax([position(self.terms[name]) for name in names], axis=0)
-        spans: list[tuple[str, float, float]] = []
+        spans = []
         for time, index in zip(self.times, first, strict=True):
             start = spans.pop()[1] if spans and spans[-1][0] == names[index] else (spans[-1][2] if spans else 0.0)
             spans.append((names[index], start, float(time)))
@@ -259,8 +259,8 @@ def consequences(
     reference = _corrected(run, run.imu)
     slopes = np.asarray(_slopes(run, reference))
     kinds = [kind_of(name, run.imu) for name in run.names]
-    terms: dict[str, FloatArray] = {}
-    known: dict[str, FloatArray] = {}
+    terms = {}
+    known = {}
     for kind in dict.fromkeys(kinds):
         chosen = np.array([other == kind for other in kinds])
         terms[kind] = _variances(slopes[..., chosen], submatrix(run.covariance, chosen))

@@ -199,7 +199,7 @@ class MeasuredErrors:
         stamp = np.asarray(mounting.on_log(known.time))
         felt = interpolated(middle, np.asarray(force), stamp)
         steady = np.ones(len(stamp), bool)
-        notes: list[str] = []
+        notes = []
         if velocity is not None:
             velocity = tilt.apply(velocity)
             steady = steady_stamps(stamp, velocity, whole.apply(felt) - [0.0, 0.0, fitted.gravity.value])
@@ -455,7 +455,7 @@ def estimator_noise(
     walks = {length: {triad: _walk(part, triad) for triad in INERTIAL_QUANTITIES} for length, part in parts.items()}
     notes += source.notes
     rng, chosen = np.random.default_rng(seed), kept.index(interval)
-    triads: dict[str, TriadNoise] = {}
+    triads = {}
     turned = np.ones(len(kept))
     for triad in _OWN:  # the gyroscope first
         rows = [
@@ -565,9 +565,9 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
         return _measured_part(stretches, spread, block)
     power = source.trajectory.excess_power({triad: noise[triad]["N"] for triad in INERTIAL_QUANTITIES})
     whole = 0.0 if pushed is None else pushed
-    moment: dict[str, FloatArray | None] = {}
-    roots: dict[str, FloatArray | None] = {}
-    terms: dict[str, dict[str, FloatArray]] = {}
+    moment = {}
+    roots = {}
+    terms = {}
     for triad, rows in _OWN.items():
         parts = {words: spread[triad, term] for term, words in _WORDS.items() if (triad, term) in spread}
         if triad in power:

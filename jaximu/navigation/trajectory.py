@@ -228,7 +228,7 @@ def of_recording(recording: Recording, calibration: Calibration, site: Place, du
     assert gyroscope is not None
     time, rate = gyroscope.time, gyroscope.values
     force = accelerometer.at(time)
-    notes: list[str] = []
+    notes = []
     if recording.attitude is not None:
         first = float(recording.attitude.time[0])
         attitude, gravity = recording.attitude.values[0], site.gravity.value

@@ -120,8 +120,8 @@ def _of_ready(ready: Sequence[Prepared]) -> NoiseAnalysis:
     recordings = [one.recording for one in ready]
     chosen = max(ready, key=lambda one: max(len(signal) for signal in one.recording.signals.values()))
     longest = chosen.recording
-    axes: dict[str, list[Identified]] = {}
-    rates: dict[str, float] = {}
+    axes = {}
+    rates = {}
     corners = [finding.numbers for finding in chosen.findings if finding.name == "data.bandwidth"]
     for name in SENSOR_QUANTITIES:
         if not getattr(longest, name) or name in unusable:

@@ -102,7 +102,7 @@ def periodic_lines(
     """
     samples = len(values)
     lines = []
-    spans: list[tuple[int, int]] = []
+    spans = []
     periodic = None
     rest, _ = without_line(values)
     for _ in range(4):

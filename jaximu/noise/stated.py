@@ -48,7 +48,7 @@ def read_sensor_noise(path: FilePath) -> SensorNoise:
 
 def sensor_noise(document: Mapping[str, Any], name: str) -> SensorNoise:
     """Return Q, N, B, K and repeatability of an `allan.json` as a dictionary called `name`; as `read_sensor_noise`."""
-    figures: dict[str, dict[str, FloatArray]] = {}
+    figures = {}
     for triad, quantity in INERTIAL_QUANTITIES.items():
         axes = document.get(triad)
         if axes is None:

@@ -170,7 +170,7 @@ def quantity(value: Any, unit: str, where: str) -> float:
 
 def _errors(table: Any, name: str, environment: Mapping[str, Any]) -> Json:
     """Check the table; sizes in SI, with the text they were stated in."""
-    sizes_of: Json = {}
+    sizes_of = {}
     latitude = "latitude" in environment
     for key, value in only(table, _ERRORS, name, "[errors]").items():
         where = f"{name}: errors.{key}"
@@ -298,7 +298,7 @@ class _Stops:
 def _stops(intervals: tuple[ScheduleEntry, ...], motion: Motion) -> _Stops:
     segment = np.searchsorted(motion.start, [interval.start + 1e-9 for interval in intervals], side="right") - 1
     begin = [Rotation.from_quat(motion.attitude[row], scalar_first=True) for row in segment]
-    up: list[FloatArray] = []
+    up = []
     setting, ends = [], []
     last: Rotation | None = None
 
@@ -392,7 +392,7 @@ def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...]
         errors,
     )
     delay, turned, coefficient, added = np.cumsum([0, *scheme.sizes])[:4]  # where each kind of error begins
-    roots: dict[str, FloatArray] = {}
+    roots = {}
 
     def add(name: str, block: FloatArray, first: int) -> None:
         root = np.zeros((sum(scheme.sizes), block.shape[1]))
@@ -474,7 +474,7 @@ def _effects_by_source(errors: StatedErrors, unit: Imu, ramps: Mapping[str, Floa
             scale = np.repeat(axes, made.size // 3) if made.size % 3 == 0 else np.full(made.size, axes.mean())
         return made, scale * np.broadcast_to(sizes, (made.size,))
 
-    sources: dict[str, list[tuple[Effect, FloatArray]]] = {}
+    sources = {}
     for source, name in (
         ("tilt", "setup.table_tilt"),
         ("gravity", "setup.gravity"),

@@ -302,7 +302,7 @@ def kalibr_text(analysis: NoiseAnalysis) -> str:
 
     One number a triad: the root mean square of its axes. A sensor that was not recorded is left out and said.
     """
-    numbers: dict[str, tuple[float, str]] = {}
+    numbers = {}
     words = {
         "measured": "identified",
         "from B": "K not seen, instead B sqrt(2/T) of the bias instability B (its correlation time T: allan.json)",
@@ -434,7 +434,7 @@ def _filter(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
 
 def _limits(analysis: NoiseAnalysis) -> Iterator[Part]:
     """Say what the length of the recording does not resolve, and how the bias differs between recordings."""
-    triads: dict[str, list[str]] = {}
+    triads = {}
     for name, axes in analysis.axes.items():
         text = (
             f"{_hours(recorded_seconds(axes[0]))} at rest resolve averages up to {_hours(axes[0].deviation.tau[-1])}; "
@@ -507,7 +507,7 @@ def _details(analysis: NoiseAnalysis, sources: Sequence[Source]) -> Iterator[Par
 def _discrete(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
     """Yield the standard deviations of a triad's samples and steps, in two units."""
     axes, quantity, rate = analysis.axes[name], SENSOR_QUANTITIES[name], analysis.rates[name]
-    rows: list[tuple[str, ...]] = []
+    rows = []
     for term, words in (("N", "white noise of one sample, σ = N √rate"), ("K", "step of the bias walk, σ = K/√rate")):
         estimates = [*(axis.terms.get(term) for axis in axes), mean_terms(axes).get(term)]
         sizes = [None if one is None else float(to_discrete(term, one.value, rate)) for one in estimates]

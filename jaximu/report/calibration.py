@@ -177,7 +177,7 @@ def _determined(calibration: Calibration) -> Iterator[str]:
 
 def _parameters(calibration: Calibration) -> Iterator[Part]:
     """Return a table of gain and bias for each triad, and one of what else was fitted."""
-    parts: list[Part] = []
+    parts = []
     for name, triad in calibration.triads().items():
         rows = tables.rows(calibration, name, triad)
         parts.append(
@@ -254,7 +254,7 @@ def _correlation(calibration: Calibration) -> Picture:
 
 def _origin(calibration: Calibration) -> Iterator[Part]:
     """Return the recording, its files and how it was fitted."""
-    parts: list[Part] = []
+    parts = []
     if calibration.segmentations:
         parts.append(
             Picture(

@@ -117,7 +117,7 @@ def _uncertainty(items: Sequence[Item]) -> Section:
 
 def _remarks(items: Sequence[Item]) -> Iterator[Statement]:
     """Yield why items are undecided and what would decide them, each text with the items that it is about."""
-    texts: dict[str, list[str]] = {}
+    texts = {}
     for item in items:
         if text := item.said():
             texts.setdefault(text, []).append(spoken(item.name))

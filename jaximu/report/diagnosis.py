@@ -83,7 +83,15 @@ def _first(diagnosis: Diagnosis, twin: Twin) -> Iterator[Part]:
     effects = [_effect_row(effect) for effect in diagnosis.effects]
     headers = ("effect", "adds up to", "coefficients ± 95 %", "evidence")
     yield Section("What is missing in the model", [Table(headers, effects)])
-    yield from _lines_part(diagnosis)
+    if diagnosis.lines:
+        picture = Picture(
+            "lines",
+            partial(_lines_figure, diagnosis),
+            "Frequency over time, at rest",
+            "Dark: power over the noise beside it, in windows at rest. Coloured: the lines that move, as followed; a "
+            "line that reaches zero frequency or half the sample rate (the edges) goes on as its mirror image.",
+        )
+        yield Section("Lines that move", [picture])
     yield from _learned_part(diagnosis)
     yield Section("What the extension gains on data that was not fitted", [*_gains(diagnosis)])
     if diagnosis.verdict == "adequate":
@@ -249,25 +257,6 @@ def _effect_row(effect: Named | NoiseFinding) -> tuple[str, str, str, str]:
         return f"{effect_title(effect.name)}\n{about}", "", numbers, evidence
     about = f"{effect.effect.formula}; belongs to the {_SCOPES[effect.scope]} {effect.file}".rstrip()
     return f"{effect.effect.title}\n{about}", f"{effect.size()}\n({effect.triad})", numbers, evidence
-
-
-def _lines_part(diagnosis: Diagnosis) -> Iterator[Section]:
-    """Return the spectral lines that move, over the spectrum that they were followed in."""
-    if not diagnosis.lines:
-        return
-    yield Section(
-        "Lines that move",
-        [
-            Picture(
-                "lines",
-                partial(_lines_figure, diagnosis),
-                "Frequency over time, at rest",
-                "Dark: power over the noise beside it, in windows at rest. Coloured: the lines that move, as "
-                "followed; a line that reaches zero frequency or half the sample rate (the edges) goes on as its "
-                "mirror image.",
-            )
-        ],
-    )
 
 
 def _lines_figure(diagnosis: Diagnosis) -> Figure:
@@ -528,7 +517,7 @@ def _ranking(panel: Axes, diagnosis: Diagnosis) -> None:
     """Draw the evidence of each effect, the strongest on top."""
     evidence = diagnosis.base.evidence
     scores = evidence.scores()
-    best: dict[str, float] = {}
+    best = {}
     for k, block in enumerate(evidence.blocks):
         if block.kind == "effect" and scores.freedom[k]:
             best[block.name] = min(best.get(block.name, 1.0), max(float(scores.p_value[k]), 1e-300))

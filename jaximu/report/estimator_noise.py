@@ -62,7 +62,7 @@ def statements(noise: EstimatorNoise) -> Iterator[Statement]:
 
 def _table(noise: EstimatorNoise) -> Table:
     """Return the multipliers, what they are made of, and the NEES with them, by length."""
-    rows: list[tuple[str, ...]] = []
+    rows = []
     for name, triad in noise.triads.items():
         rows.append((f"{name}, N times (95 %)", *_multipliers(triad)))
         rows += [

@@ -160,7 +160,7 @@ def _triads(calibration: Calibration, history: History) -> Iterator[tuple[str, l
 
 def _effects(calibration: Calibration, history: History) -> Iterable[tuple[str, list[_Line]]]:
     """Return the title of each panel of effects' numbers, and its lines."""
-    groups: dict[str, list[_Line]] = {}
+    groups = {}
     units = {name: triad.output_unit for name, triad in calibration.triads().items()}
     for state, name in enumerate(history.names):
         effect = calibration.imu.all_effects().get(name.key)

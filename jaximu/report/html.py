@@ -46,8 +46,8 @@ def encoded(page: Page) -> tuple[bytes, dict[str, bytes]]:
     The page has no folders of the machine that made it. In place of a figure that cannot be drawn the page says so.
     """
     first, rest = [*page.first], [*page.rest()]
-    pictures: dict[str, bytes] = {}
-    drawings: dict[str, Drawing | str] = {}
+    pictures = {}
+    drawings = {}
     for picture in _pictures([*first, *rest]):
         try:
             drawings[picture.name], pictures[f"{picture.name}.png"] = _drawn(picture.draw(), picture.name)

@@ -32,7 +32,7 @@ def page_of(recording: Recording) -> Page:
 
 def log_page(document: Mapping[str, Any], commands: Sequence[str]) -> Page:
     """Return the page of a log that `jaximu info` described; `commands`: a line to paste for each use, or none."""
-    uses: list[Part] = []
+    uses = []
     for use, command in zip(document["uses"] if commands else (), commands, strict=True):
         uses += [f"{sentence(use['why'])}:", Code(command)]
     return _page(

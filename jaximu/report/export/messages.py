@@ -93,7 +93,7 @@ _STATUS = "diagnostic_msgs/msg/DiagnosticArray"
 
 def _streams(topic: str, recording: Recording) -> Iterator[_Stream]:
     """Yield a recording's messages; sensors that share their stamps share a message."""
-    held: list[tuple[str, Signal]] = []
+    held = []
     for name in ("accelerometer", "gyroscope"):
         signal = recording.signals.get(name)
         if signal is not None and signal.unit == "count":

@@ -15,7 +15,7 @@ SUMMARY = "NumPy arrays, with the covariance"
 
 def write(parameters: ExportedUnit) -> Written:
     """Write `<triad>_gain`, `_bias`, `_inverse_gain`, `_unit`, and `covariance` with its `parameters` (body axes)."""
-    arrays: dict[str, np.ndarray] = {}
+    arrays = {}
     for name, triad in parameters.triads.items():
         arrays |= {f"{name}_gain": triad.gain, f"{name}_bias": triad.bias, f"{name}_inverse_gain": triad.inverse}
         arrays[f"{name}_unit"] = np.array(triad.unit)

@@ -60,7 +60,7 @@ def px4_parameters(
         raise InputError(f"PX4 has temperature calibrations 0 to 3 of each sensor, found {instance}.")
     targets = _Targets(calibration)
     reference = float(np.round((targets.low + targets.high) / 2, 2))
-    parameters: dict[str, float] = {}
+    parameters = {}
     for name, letter, number in (("accelerometer", "A", accelerometer_id), ("gyroscope", "G", gyroscope_id)):
         if name not in targets.calibration.triads():
             continue
