@@ -200,7 +200,8 @@ def accept(
 
 def _item(calibration: Calibration, units: Units, limits: Limits, judged: Judged, index: int) -> Item:
     limit, at, measured, name = judged.limits[index], judged.places[index], judged.measured, judged.names[index]
-    calibrated, warm = calibration.data.get("temperature_range"), limit.temperature
+    calibrated = calibration.data.get("temperature_range")
+    warm = limit.temperature
     reason = _not_stated(limit, units, limits)
     if reason:
         return Item.of(limit, name, reason=reason)
@@ -246,7 +247,8 @@ def _noise_items(limit: Limit, rule: Rule, noise: Mapping[str, Any] | None) -> l
             items.append(Item.of(limit, name, reason=reason, advice=advice))
             continue
         value, low, high = (float(term[key]) for key in _TERM)
-        sigma, advice = (high - low) / (2 * Z95), ""
+        sigma = (high - low) / (2 * Z95)
+        advice = ""
         judged = limit.judged(rule, value, sigma)
         if judged["verdict"] == UNDECIDED:
             needed = limit.nearest(value) / float(rule.multiple())

@@ -46,7 +46,8 @@ class Rule:
 
     def verdicts(self, probability: ArrayLike, inside: ArrayLike) -> NDArray[np.str_]:
         """Return the verdicts (...) of probabilities of conformity and of whether the values lie within the limits."""
-        probability, inside = np.asarray(probability), np.asarray(inside)
+        probability = np.asarray(probability)
+        inside = np.asarray(inside)
         if self.kind == "simple":
             return np.where(inside, PASS, FAIL)
         # rounding of the distribution must not decide at the very edge of the guard band

@@ -99,8 +99,7 @@ def in_own_axes(calibration: Calibration) -> tuple[Calibration, bool]:
     fitted = {name.owner for name in calibration.names if name.part == "gain"}
     new = zip(owners, np.asarray(turned(gains)), strict=True)
     imu = replace(calibration.imu, **{owner: replace(triads[owner], gain=gain) for owner, gain in new})
-    whole = replace(calibration, imu=imu, names=names, covariance=covariance)
-    return whole.of_numbers(
+    return replace(calibration, imu=imu, names=names, covariance=covariance).of_numbers(
         lambda name: without_equipment_or_effects(name) and (name.part != "gain" or name.owner in fitted)
     ), True
 
@@ -125,7 +124,8 @@ def _epoch(calibration: Calibration, reasons: Mapping[str, str], file: str, turn
     by_gravity = calibration.gravity_shift()
     quantities = {}
     for column, name in enumerate(measured.names):
-        stem, owner = name.partition("[")[0], owner_of(name)
+        stem = name.partition("[")[0]
+        owner = owner_of(name)
         if owner not in calibration.triads() or (stem in CATALOGUE and CATALOGUE[stem].scope != "device"):
             continue
         unless = reasons.get(stem, "") or reasons.get(owner, "")
@@ -184,7 +184,8 @@ def _at_temperatures(calibration: Calibration, common: Mapping[str, float]) -> t
                 f"{owner}.{part}": f"one holds it at {reference:g} °C, another not"
                 for part in ("scale", "misalignment")
             }
-        rows, effects = still, [triad.effects[row] for row in still]
+        rows = still
+        effects = [triad.effects[row] for row in still]
         (there, here), (slope, origin) = steady(effects, [celsius, reference], 0.0, reference)
         alone = [name for name in effect_numbers(calibration.imu.with_effects(*effects))[0] if name.effect is not None]
         numbers = [Name(owner, name.part, name.axes, rows[name.effect or 0]) for name in alone]

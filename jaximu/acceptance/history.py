@@ -224,14 +224,14 @@ def compare(
     files = tuple(files) or tuple(f"calibration {number}" for number in range(1, len(calibrations) + 1))
     require_apart(calibrations, files)
     order, days, times, per, notes = _in_order(calibrations, files, dates)
-    ordered, files = [calibrations[index] for index in order], tuple(files[index] for index in order)
+    ordered = [calibrations[index] for index in order]
+    files = tuple(files[index] for index in order)
     limits = limits or Limits((), Rule(), {}, "", "")
     epochs = epochs_of(ordered, files, limits.nominal)
     names, left_out = _comparable(epochs)
     covariance = _covariance(epochs, names)
     movements = _courses(epochs, names, covariance, times, level)
-    values = np.array([movement.values for movement in movements]).T
-    together = _together(movements, values, covariance)
+    together = _together(movements, np.array([movement.values for movement in movements]).T, covariance)
     output, silent = _outputs(epochs[0], epochs[-1], names, rate)
     reached, unknown = _limits_reached(movements, limits, epochs[0].calibration)
     return UnitHistory(
@@ -286,9 +286,11 @@ def _comparable(epochs: Sequence[Epoch]) -> tuple[list[str], list[str]]:
     reasons = [_apart(epochs[0], epoch) for epoch in epochs[1:]]
     apart = {owner: reason for part in reasons for owner, reason in part.items()}
     everything = list(dict.fromkeys(name for epoch in epochs for name in epoch.quantities))
-    names, left_out = [], {}
+    names = []
+    left_out = {}
     for name in everything:
-        stem, owner = name.partition("[")[0], owner_of(name)
+        stem = name.partition("[")[0]
+        owner = owner_of(name)
         lacking = [epoch.file for epoch in epochs if name not in epoch.quantities]
         unless = [epoch.quantities[name].unless for epoch in epochs if name in epoch.quantities]
         if owner in apart:
@@ -333,7 +335,8 @@ def _has_axes(effect: Effect | type[Effect]) -> bool:
 def _apart(first: Epoch, other: Epoch) -> dict[str, str]:
     """Return why triads, or their gains, of two calibrations are not of one kind."""
     reasons = {}
-    triads, others = first.calibration.triads(), other.calibration.triads()
+    triads = first.calibration.triads()
+    others = other.calibration.triads()
     readings = first.calibration.reading, other.calibration.reading
     for owner in triads.keys() & others.keys():
         units = triads[owner].output_unit, others[owner].output_unit
@@ -354,7 +357,8 @@ def _apart(first: Epoch, other: Epoch) -> dict[str, str]:
 def _covariance(epochs: Sequence[Epoch], names: Sequence[str]) -> FloatArray:
     """Return the covariance (n q, n q) of quantities in all calibrations, with what gravity's error makes of it."""
     size = len(names)
-    covariance, by_gravity = np.zeros((len(epochs) * size,) * 2), []
+    covariance = np.zeros((len(epochs) * size,) * 2)
+    by_gravity = []
     for index, epoch in enumerate(epochs):
         slope = np.array([epoch.quantities[name].slope for name in names])
         rows = slice(index * size, (index + 1) * size)
@@ -413,7 +417,6 @@ def _kind(name: str) -> str:
 
 
 def _together(movements: Sequence[Movement], values: FloatArray, covariance: FloatArray) -> dict[str, Sameness]:
-    """Return χ² of each kind of number, and of all that are tested."""
     count, size = values.shape
 
     def test(chosen: list[int]) -> Sameness:
@@ -433,7 +436,8 @@ def _together(movements: Sequence[Movement], values: FloatArray, covariance: Flo
 
 def _outputs(first: Epoch, last: Epoch, names: Sequence[str], rate: float) -> tuple[dict[str, OutputChange], list[str]]:
     """Return what the change does to each triad's corrected output, and why that is not known of others."""
-    changes, silent = {}, []
+    changes = {}
+    silent = []
     for owner in dict.fromkeys(map(owner_of, names)):
         needed = [
             name
@@ -459,7 +463,8 @@ def _output(first: Epoch, last: Epoch, owner: str, over: float) -> OutputChange:
 
     Raises `InputError` where an effect needs what is not known of the input.
     """
-    unit, quantity = first.calibration.imu, SENSOR_QUANTITIES[owner]
+    unit = first.calibration.imu
+    quantity = SENSOR_QUANTITIES[owner]
     limit = Limit(owner, owner, "output", (), -np.inf, np.inf, SENSOR_UNITS[owner], over=over)
     directions = getattr(output_stimulus(limit, unit.with_effects()), quantity)
     celsius = np.full(len(directions), unit.triads()[owner].temperature_reference)
@@ -476,7 +481,8 @@ def _output(first: Epoch, last: Epoch, owner: str, over: float) -> OutputChange:
         return error(*flats), jax.jacfwd(error, (0, 1))(*flats)
 
     values, slopes = stored.call(both, f"compare {owner}", [flatten(model) for model in models], models, stimulus)
-    spread, common = np.zeros((len(values), 3, 3)), []
+    spread = np.zeros((len(values), 3, 3))
+    common = []
     for epoch, slope in zip((first, last), slopes, strict=True):
         every = names_of(epoch.calibration.imu)
         free = slope[..., [every.index(name) for name in epoch.calibration.names]]
@@ -513,8 +519,8 @@ def _error(first: Imu, last: Imu, stimulus: Stimulus, owner: str) -> Any:
 def _limits_reached(
     movements: Sequence[Movement], limits: Limits, first: Calibration
 ) -> tuple[tuple[LimitReached, ...], list[str]]:
-    """Return when each limit's guard band is reached, and which limits cannot be followed, in sentences."""
-    reached, unknown = [], []
+    reached = []
+    unknown = []
     for limit in limits.limits:
         triad = first.triads().get(limit.owner)
         followed = [movement for movement in movements if limits.applies(limit, movement.name)]
@@ -535,11 +541,9 @@ def _limits_reached(
 
 
 def _notes(epochs: Sequence[Epoch], nominal: Scales) -> list[str]:
-    """Return what else a reader should know of the comparison."""
-    triads = epochs[0].calibration.triads().items()
     notes = [
         f"the {name} was logged in counts: its scale and bias are relative to the first calibration's."
-        for name, triad in triads
+        for name, triad in epochs[0].calibration.triads().items()
         if triad.output_unit == "count" and name not in nominal
     ]
     if len(epochs) == 2:

@@ -134,7 +134,8 @@ def _openhtf(rows: list[Json]) -> bytes:
         verdict = worst([row["verdict"] for row in some])
         day = some[0]["date"]
         stamp = round(1000 * datetime.fromisoformat(day).replace(tzinfo=UTC).timestamp()) if day else None
-        outcome, marginal = "PASS" if verdict == PASS else "FAIL", verdict == UNDECIDED
+        outcome = "PASS" if verdict == PASS else "FAIL"
+        marginal = verdict == UNDECIDED
         missed = [row for row in some if row["verdict"] != PASS]
         details = [{"code": verdict, "description": f"{row['name']}: {_said(row)}"} for row in missed]
         times = {"start_time_millis": stamp, "end_time_millis": stamp}

@@ -138,7 +138,8 @@ def read_limits(path: FilePath, rule: str | None = None, risk: float | None = No
     source = str(document.get("source", ""))
     limits = tuple(_limit(key, value, source, f"{name}, {key}") for key, value in stated.items())
     _refuse_contradictions(limits, name)
-    kind, level = rule or document.get("rule", "guarded"), document.get("risk", 0.05) if risk is None else risk
+    kind = rule or document.get("rule", "guarded")
+    level = document.get("risk", 0.05) if risk is None else risk
     if isinstance(level, bool) or not isinstance(level, int | float):
         raise InputError(f"{name}: the risk is a number such as 0.05, not {level!r}.")
     return Limits(
@@ -169,7 +170,8 @@ def _limit(key: str, stated: Any, source: str, where: str) -> Limit:
         raise InputError(
             f"{where}: the limits contradict each other: the lower, {low:g}, is not below {high:g} {base}."
         )
-    over, temperature = 0.0, None
+    over = 0.0
+    temperature = None
     if part in OUTPUTS:
         if "over" not in entry:
             raise InputError(f'{where}: say up to which input the output is limited: over = "1 g" (or "300 deg/s").')
@@ -192,7 +194,6 @@ def _limit(key: str, stated: Any, source: str, where: str) -> Limit:
 
 
 def _meaning(key: str, where: str) -> tuple[str, str, tuple[int, ...], str]:
-    """Return the triad, the quantity, the axes and the unit that a key means."""
     match = _KEY.fullmatch(key)
     name = match[1] if match else ""
     axes = tuple(int(digit) for digit in match.groups()[1:] if digit) if match else ()
@@ -241,7 +242,6 @@ def _value(stated: Any, base: str, where: str) -> float:
 
 
 def _split(stated: Any, where: str, hint: str) -> tuple[float, str]:
-    """Return a number and the text of its unit."""
     match = NUMBER_WITH_UNIT.fullmatch(stated) if isinstance(stated, str) else None
     if match is None or not match[2]:
         raise InputError(f"{where}: {stated!r} needs a number with its unit{hint}.")
@@ -249,7 +249,6 @@ def _split(stated: Any, where: str, hint: str) -> tuple[float, str]:
 
 
 def _range(stated: Any, where: str) -> tuple[float, float]:
-    """Return two temperatures in °C."""
     temperatures = []
     for end in stated if isinstance(stated, list) else [stated]:
         number, text = _split(end, where, ': ["-10 degC", "60 degC"]')

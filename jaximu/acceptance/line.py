@@ -372,9 +372,11 @@ def follow(table: Batch, limits: Limits | None = None, golden: str = "") -> Line
     watched = (np.array(table.devices) == golden) & np.isfinite(table.days)
     shown = [column for column in range(len(measured.names)) if not measured.fixed[column]]
     by_name = {} if judged is None else dict(zip(judged.names, judged.limits, strict=True))
-    followed, alarms = [], []
+    followed = []
+    alarms = []
     for column in shown:
-        name, values = measured.names[column], measured.value[:, column]
+        name = measured.names[column]
+        values = measured.value[:, column]
         recording = root_or_zero(measured.sigma[:, column] ** 2 - measured.gravity[:, column] ** 2)
         charts = {}
         for station in stations:
@@ -417,7 +419,8 @@ def _alarms(
         what = spoken(name) + (f" at station {station}" if station else "")
         off = np.abs(chart.average - chart.centre)
         if len(chart.drifting):
-            start, most = int(chart.drifting[0]), int(chart.drifting[off[chart.drifting].argmax()])
+            start = int(chart.drifting[0])
+            most = int(chart.drifting[off[chart.drifting].argmax()])
             side = "above" if chart.average[most] > chart.centre else "below"
             texts = (
                 f"{what}: the moving average left its limits at {_when(table, int(places[start]))} and is farthest, ",
@@ -459,7 +462,8 @@ def _compared(
     questions: int,
 ) -> list[Alarm]:
     """Name the stations or lots whose units (first,) differ from the others', the surest first."""
-    alarms, left = [], dict(groups)
+    alarms = []
+    left = dict(groups)
     while len(left) > 1:
         shifts = {
             label: _shift(values, np.isin(first, places), np.isin(first, np.concatenate([*left.values()])))
@@ -480,7 +484,8 @@ def _shift(values: FloatArray, inside: BoolArray, all_of: BoolArray) -> tuple[fl
     """Return by how much the values inside differ from the others in the mean, and the p-value of Welch's test."""
     sides = values[inside], values[all_of & ~inside]
     parts = np.array([np.var(side, ddof=1) / len(side) for side in sides])
-    shift, variance = float(sides[0].mean() - sides[1].mean()), float(parts.sum())
+    shift = float(sides[0].mean() - sides[1].mean())
+    variance = float(parts.sum())
     freedom = variance**2 / float((parts**2 / np.array([len(side) - 1 for side in sides])).sum())
     return shift, float(student_two_sided(shift / np.sqrt(variance), freedom))
 

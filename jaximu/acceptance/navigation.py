@@ -33,9 +33,11 @@ def navigation_items(
 
     **Arguments:** `noise`: an `allan.json` as a dictionary; `file`: what the calibration is called.
     """
-    items, notes = [], []
+    items = []
+    notes = []
     known = None if noise is None else sensor_noise(noise, "the allan.json")
-    site, by_gravity = Place(_LATITUDE, 0.0, calibration.gravity), calibration.gravity_shift()
+    site = Place(_LATITUDE, 0.0, calibration.gravity)
+    by_gravity = calibration.gravity_shift()
     gravity_known = replace(calibration, covariance=calibration.covariance - np.outer(by_gravity, by_gravity))
     for after in dict.fromkeys(limit.after for limit in limits):
         here = [limit for limit in limits if limit.after == after]
@@ -66,10 +68,12 @@ def _item(
 ) -> Item:
     """Return the item of an error about zero with these standard deviations; gravity_sigma: m/s²."""
     sigma = float(np.sqrt(recording**2 + gravity**2 + noise**2))
-    judged, advice = limit.judged(rule, 0.0, sigma), ""
+    judged = limit.judged(rule, 0.0, sigma)
+    advice = ""
     if judged["verdict"] == UNDECIDED:
         needed = limit.nearest(0.0) / float(normal_isf(rule.risk / 2))  # both sides of zero count, hence half the risk
-        left, advice = needed**2 - noise**2, "The sensors' noise alone is too much for this limit."
+        left = needed**2 - noise**2
+        advice = "The sensors' noise alone is too much for this limit."
         if left > 0:
             advice = deciding(float(np.sqrt(left)), recording, gravity, gravity_sigma, "longer rests.")
     return Item.of(

@@ -82,8 +82,10 @@ class Measured:
 
 def of_calibration(calibration: Calibration) -> Units:
     """Return a calibration as one unit, without effects of a session or of the set-up."""
-    imu, names = calibration.imu, calibration.names
-    data, excess = calibration.data, calibration.excess
+    imu = calibration.imu
+    names = calibration.names
+    data = calibration.data
+    excess = calibration.excess
     numbers = {owner: sum(name.owner == owner for name in names) for owner in SENSOR_QUANTITIES}
     poses, turns = data.get("poses"), data.get("turns")
     counts = {}

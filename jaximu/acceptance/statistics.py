@@ -77,7 +77,8 @@ def control_chart(values: FloatArray, level: float) -> Chart:
     count = len(values)
     ranges = np.abs(np.diff(values))
     # two normal numbers have a mean range of 2/√π = 1.128 of their deviation
-    centre, deviation = float(values.mean()), float(ranges.mean() * np.sqrt(np.pi) / 2)
+    centre = float(values.mean())
+    deviation = float(ranges.mean() * np.sqrt(np.pi) / 2)
     bound = float(normal_isf(level / 2 / count))
     average = np.empty(count)
     running = centre
@@ -150,7 +151,8 @@ def gauge(values: FloatArray, sigma: FloatArray, parts: Sequence[str], places: S
     kept = np.array([times[part] > 1 for part in parts], bool)
     if len(set(np.asarray(parts)[kept])) < 2:  # a part measured once says nothing of the gauge
         return None
-    values, sigma = values[kept], sigma[kept]
+    values = values[kept]
+    sigma = sigma[kept]
     part, site = (np.unique(np.asarray(labels)[kept], return_inverse=True)[1] for labels in (parts, places))
     size, sites, count = int(part.max()) + 1, int(site.max()) + 1, len(values)
     cell = part * sites + site
@@ -162,15 +164,18 @@ def gauge(values: FloatArray, sigma: FloatArray, parts: Sequence[str], places: S
         mean = np.bincount(labels, weight * values) / np.bincount(labels, weight)
         return float(weight @ (values - mean[labels]) ** 2)
 
-    alike, freedom = np.ones(count), count - size
+    alike = np.ones(count)
+    freedom = count - size
     whole, within = about_means(np.zeros_like(part), alike), about_means(part, alike)
     error, rest, against, reproducibility = within, freedom, within / freedom, 0.0
     if crossed:
         squares, error, rest = whole - about_means(site, alike), about_means(cell, alike), count - size * sites
-        interaction, degrees = max(within - squares - error, 0.0), (size - 1) * (sites - 1)
+        interaction = max(within - squares - error, 0.0)
+        degrees = (size - 1) * (sites - 1)
         against = interaction / degrees
         if rest == 0 or f_tails(against / max(error / rest, 1e-300), degrees, rest)[1] > _POOLED:
-            error, rest = error + interaction, rest + degrees
+            error = error + interaction
+            rest = rest + degrees
             against = error / rest
         of_place = max(squares / (sites - 1) - against, 0.0) / size + max(against - error / rest, 0.0)
         reproducibility = float(np.sqrt(of_place / number[0]))

@@ -47,12 +47,14 @@ def sameness(values: FloatArray, covariance: FloatArray) -> Sameness:
     """Test whether q quantities are the same in all n measurements: values (n, q), covariance (n q, n q)."""
     count, size = values.shape
     contrasts = np.kron(_contrasts(np.ones((count, 1))), np.eye(size))
-    difference, spread = contrasts @ values.ravel(), contrasts @ covariance @ contrasts.T
+    difference = contrasts @ values.ravel()
+    spread = contrasts @ covariance @ contrasts.T
     scale = sigmas_of(spread)
     roots, vectors = np.linalg.eigh(spread / scale[:, None] / scale)
     kept = roots > _ROUNDING * roots[-1]
     along = vectors[:, kept].T @ (difference / scale)
-    statistic, freedom = float((along**2 / roots[kept]).sum()), int(kept.sum())
+    statistic = float((along**2 / roots[kept]).sum())
+    freedom = int(kept.sum())
     return Sameness(statistic, freedom, float(chi2_sf(statistic, freedom)))
 
 
@@ -78,7 +80,8 @@ class StraightLine:
     def through(cls, times: FloatArray, values: FloatArray, covariance: FloatArray) -> StraightLine:
         """Fit values (n,) with their covariance (n, n) at times (n,), not all alike, the last of them last."""
         columns = np.stack([np.ones(len(times)), times - times[-1]], axis=1)
-        contrasts, left = _contrasts(columns), len(times) - 2
+        contrasts = _contrasts(columns)
+        left = len(times) - 2
         roots, vectors = np.linalg.eigh(contrasts @ covariance @ contrasts.T)
         squares = (vectors.T @ (contrasts @ values)) ** 2
         statistic = float((squares / roots).sum())
@@ -118,7 +121,8 @@ class StraightLine:
         """Solve (d − s t)² = k² (v + 2 c t + w t²) for the first t ≥ 0; d: distance to the limit, s: slope to it."""
         (level, cross), (_, slope) = self.covariance
         level += self.scatter**2
-        distance, approach = side * (end - self.level), side * self.slope
+        distance = side * (end - self.level)
+        approach = side * self.slope
         if distance - multiple * np.sqrt(level) <= 0:
             return 0.0
         square = approach**2 - multiple**2 * slope

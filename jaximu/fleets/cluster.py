@@ -26,7 +26,8 @@ def compute(jobs: Sequence[Job], indices: Sequence[int], settings: Settings, wor
     """
     away = "RAY_ADDRESS" in os.environ
     folder = None if away else stored.folder()  # on other machines there is no such folder
-    started, effects = not ray.is_initialized(), own_effects()
+    started = not ray.is_initialized()
+    effects = own_effects()
     if started:
         where: Json = {} if away else {"num_cpus": workers, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
         ray.init(log_to_driver=False, logging_level=logging.ERROR, runtime_env={"env_vars": ONE_THREAD}, **where)

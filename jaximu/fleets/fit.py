@@ -41,7 +41,8 @@ class FleetUnit:
         data = PosesAndTurns.of(self.observations)
         if data.slow is not None:  # it ties intervals, of which padding would make others
             return data
-        poses, interval = np.asarray(data.poses.mask), np.asarray(data.turns.interval)
+        poses = np.asarray(data.poses.mask)
+        interval = np.asarray(data.turns.interval)
         samples = int(np.flatnonzero(interval.any(axis=0)).max(initial=0)) + 1 if self.gyroscope else 1
         last = int(np.flatnonzero(poses).max(initial=0)) + 1
         return data.widened(_padded(last, 8), _padded(samples, 32) if self.gyroscope else 1)
@@ -62,13 +63,11 @@ def fit_units(units: Sequence[FleetUnit]) -> list[tuple[Fit, FloatArray]]:
     for (gyroscope, _), group in groups.items():
         for first in range(0, len(group), _BATCH):
             indices, data = zip(*group[first : first + _BATCH], strict=True)
-            fitted = _together([units[index].nominal for index in indices], data, gyroscope)
-            fits |= zip(indices, fitted, strict=True)
+            fits |= zip(indices, _together([units[index].nominal for index in indices], data, gyroscope), strict=True)
     return [fits[index] for index in range(len(units))]
 
 
 def _together(nominals: Sequence[Imu], data: Sequence[PosesAndTurns], gyroscope: bool) -> list[tuple[Fit, FloatArray]]:
-    """Fit units whose arrays have one shape."""
     starts = jax.tree.map(lambda leaf: np.asarray(leaf, float), stacked(nominals))
     together = stacked(data)
     fits = fit_hand_held(starts, together, "joint" if gyroscope else "accelerometer")

@@ -261,7 +261,8 @@ def _read_manifest(path: Path) -> list[Job] | None:
         return None
     if not rows:
         raise InputError(f"{path}: the manifest is empty: it needs one row a recording below its header.")
-    jobs, files = [], {}
+    jobs = []
+    files = {}
     for number, row in rows:
         if len(row) != len(header):
             raise InputError(f"{path}, row {number}: {len(row)} cells under {len(header)} column names.")
@@ -273,16 +274,14 @@ def _read_manifest(path: Path) -> list[Job] | None:
         if file in files:
             raise InputError(f"{path}, row {number}: {cells['file']} stands in row {files[file]} already.")
         files[file] = number
-        options = _parse_options(cells.get("options", ""), f"{path}, row {number}", path.parent)
-        static = str(path.parent / cells["static"]) if cells.get("static") else ""
         jobs.append(
             Job(
                 cells["device"],
                 file,
                 cells.get("date", ""),
                 cells.get("lot", ""),
-                options,
-                static,
+                _parse_options(cells.get("options", ""), f"{path}, row {number}", path.parent),
+                str(path.parent / cells["static"]) if cells.get("static") else "",
                 cells.get("station", ""),
             )
         )

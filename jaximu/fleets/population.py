@@ -246,7 +246,8 @@ def _maximise(values, covariances, mean, covariance):
         # p units without correlations: what keeps the matrix regular when there are hardly more units than parameters
         fresh = (summed + size * np.diag(summed.diagonal() / count)) / (count + size)
         change = np.abs(np.sqrt(fresh.diagonal() / np.diagonal(covariance)) - 1).max()
-        mean, covariance = better, fresh
+        mean = better
+        covariance = fresh
         if change < 1e-3:
             break
     return mean, covariance
@@ -273,7 +274,8 @@ class _Units:
 def _units(rows: list[Json], gyroscope: bool) -> _Units:
     """Bring calibrated rows to one scale: gains in nominal scales, biases as inputs in SI."""
     indices = free_places(gyroscope)
-    count, size = len(rows), len(PARAMETERS)
+    count = len(rows)
+    size = len(PARAMETERS)
     factor, (raw, offset) = np.ones((count, size)), np.zeros((2, count, size))
     for name, part in list(COLUMN_PLACES.items())[: 2 + 2 * gyroscope]:
         scale, zero = np.split(np.array([row[f"{name.partition('_')[0]}_nominal"] for row in rows], float), 2, axis=1)
@@ -411,7 +413,8 @@ class _Groups:
 
     @classmethod
     def of(cls, units: _Units) -> _Groups:
-        days, lots = days_of([row["date"] for row in units.rows]), np.array(_names(units))
+        days = days_of([row["date"] for row in units.rows])
+        lots = np.array(_names(units))
         known = np.isfinite(days)
         dated = bool(known.sum() >= FEWEST and np.ptp(days[known]) >= 1)
         middle = float(days[known].mean()) if dated else 0.0
@@ -442,7 +445,8 @@ class _Groups:
 
         By medians, so that a stranger moves nothing.
         """
-        values, years = values - np.median(values, axis=0), np.array(self.years)
+        values = values - np.median(values, axis=0)
+        years = np.array(self.years)
         for index in range(len(self.names) + 1):
             members = self.lot == index
             if members.sum() >= 3:
@@ -468,7 +472,8 @@ def _lots_and_dates(units: _Units) -> tuple[list[Difference], Shifts]:
     parameter, what explains most (the time, or one lot) is taken first, then what explains most of the rest, until
     nothing is left that counts; then all that was taken is estimated together.
     """
-    groups, size = _Groups.of(units), len(units.names)
+    groups = _Groups.of(units)
+    size = len(units.names)
     shifts = Shifts({}, np.zeros(size), groups.middle)
     if not (groups.names or groups.dated) or len(units.rows) < FEWEST:
         return [], shifts
@@ -581,11 +586,17 @@ def _shared_effects(units: _Units) -> list[Difference]:
             table = [[int((shown & side).sum()), int((~shown & side).sum())] for side in (inside, outside)]
             p_value = float(scipy.stats.fisher_exact(table, "greater")[1]) * len(names) * len(groups)
             if p_value < LEVEL:
-                text = (
-                    f"lot {group} shares {effect_title(effect)}: found in {table[0][0]} of its {int(inside.sum())} "
-                    f"units, in {table[1][0]} of {int(outside.sum())} others"
+                differences.append(
+                    Difference(
+                        "effect",
+                        group,
+                        table[0][0],
+                        p_value,
+                        (),
+                        f"lot {group} shares {effect_title(effect)}: found in {table[0][0]} of its {int(inside.sum())} "
+                        f"units, in {table[1][0]} of {int(outside.sum())} others",
+                    )
                 )
-                differences.append(Difference("effect", group, table[0][0], p_value, (), text))
     return differences
 
 
@@ -612,7 +623,8 @@ def write_shrunk(fleet: Fleet, path: FilePath) -> None:
             values, sigma = np.zeros((2, len(rows), len(PARAMETERS)))
             values[:, places] = mean + moved
             sigma[:, places] = root_or_zero(variances_of(spread))
-            values, sigma = values * units.factor + units.offset, sigma * units.factor
+            values = values * units.factor + units.offset
+            sigma = sigma * units.factor
             out: dict[str, list] = {name: [row[name] for row in rows] for name in ("device", "file")}
             for name, part in COLUMN_PLACES.items():
                 there = gyroscope or name.startswith("accel")

@@ -242,7 +242,8 @@ def rows_of(jobs: Sequence[Job], settings: Settings) -> list[Json]:
 
 
 def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> Json:
-    row, unit = prepared.row, prepared.unit
+    row = prepared.row
+    unit = prepared.unit
     assert unit is not None
     try:
         _require(fit, row["poses"], row["file"], "accelerometer")
@@ -257,8 +258,7 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> Js
     unusual = unusual_gains(fit.imu, weak, scales) if scales else []
     for finding in unusual:
         if finding.apply is not None:  # in wrong axes the unit is none of the population
-            wrong = NotPossibleError(f"{row['file']}: {finding.text.partition(';')[0]}.")
-            return row | _failure(wrong)
+            return row | _failure(NotPossibleError(f"{row['file']}: {finding.text.partition(';')[0]}."))
     kinds = len(EXCESS_NAMES) if unit.gyroscope else 1
     whole = np.zeros((len(PARAMETERS), len(PARAMETERS)))
     places = [PARAMETERS.index(name) for name in fit.names]
@@ -277,7 +277,8 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> Js
     if unit.gyroscope and row["turns"]:
         row["gyro_rms"] = float(rms[1])
     left = [name in open_numbers(weak) for name in PARAMETERS]
-    values, known = flatten(fit.imu), np.ma.masked_array(sigma, left).tolist()
+    values = flatten(fit.imu)
+    known = np.ma.masked_array(sigma, left).tolist()
     for name, part in list(COLUMN_PLACES.items())[: 2 + 2 * unit.gyroscope]:
         row[name], row[f"{name}_sigma"] = values[part], known[part]
     if any(left):

@@ -147,7 +147,8 @@ class Consequences(Result, Document, page="consequences"):
         def listed(errors: Mapping[str, FloatArray]) -> list[Json]:
             return [{"term": name, "position": values.tolist()} for name, values in errors.items()]
 
-        check, against = self.check, self.against
+        check = self.check
+        against = self.against
         known = self.known | {"the whole calibration": np.zeros_like(self.noise)}
         return {
             "schema": SCHEMA,
@@ -313,7 +314,8 @@ def prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> Run
             f"{file} states no covariance, so what it leaves open is not known: calibrate the log again with "
             "`jaximu calibrate LOG -o DIR`."
         )
-    imu, stimulus = on_host(imu), trajectory.stimulus
+    imu = on_host(imu)
+    stimulus = trajectory.stimulus
     return Run(
         imu,
         trajectory.start,
@@ -369,7 +371,8 @@ def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
     stimulus = path.stimulus
     vectors = increments(*map(jnp.asarray, (stimulus.angular_rate, stimulus.specific_force, path.intervals)))
     transition, reaction = compiled(linearised)(path.start, *vectors, jnp.asarray(path.intervals))
-    terms, interval = {}, path.interval
+    terms = {}
+    interval = path.interval
     propagate = compiled(noise_covariance)
     for triad, term in wanted:
         columns = reaction[..., :3] if triad == "gyroscope" else reaction[..., 3:]
@@ -381,7 +384,6 @@ def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
 
 
 def _draw(run: Run, path: Trajectory, reference: Navigation, noise: SensorNoise, draws: int, seed: int) -> MonteCarlo:
-    """Draw all errors at once and mechanise."""
     rng = np.random.default_rng(seed)
     root = root_of(run.covariance)
     streams = [

@@ -125,7 +125,8 @@ class ModelledErrors:
 
     def over(self, length: float) -> Stretches:
         """Return stretches of one length (s), one after the other."""
-        stimulus, intervals = self.trajectory.stimulus, self.trajectory.intervals
+        stimulus = self.trajectory.stimulus
+        intervals = self.trajectory.intervals
         size = max(2, round(length * self.rate))
         first = _spread(np.arange(0, len(intervals) - size + 1, size))
         rows = first[:, None] + np.arange(size)
@@ -142,9 +143,8 @@ class ModelledErrors:
         """
         run = prepared(self.calibration, self.trajectory, self.file)
         reacted = np.asarray(_reaction(run))
-        change = reacted - np.average(reacted, axis=0, weights=self.trajectory.intervals)
         return (
-            change,
+            reacted - np.average(reacted, axis=0, weights=self.trajectory.intervals),
             run.covariance,
             [kind_of(name, run.imu) for name in run.names],
             [name.owner for name in run.names],
@@ -188,7 +188,8 @@ class MeasuredErrors:
         """
         require_float64()
         fitted, measurement = calibrate_against_attitude(recording, attitude, gravity, unit=unit)
-        data, known = measurement.intervals, measurement.attitude
+        data = measurement.intervals
+        known = measurement.attitude
         mounting = Mounting.of(fitted.imu)
         middle = (data.since + data.until) / 2
         beside = measurement.around(fitted.imu).beside_motion()
@@ -263,7 +264,8 @@ class MeasuredErrors:
         """Return errors (n, 3, 6 or 9) of ΔR, Δv, Δp and of Δv with the reference's rotation (n, 3), or None."""
         rotations = scipy.spatial.transform.Rotation
         known = rotations.from_quat(self.rotation, scalar_first=True)
-        at_start, time = known[first], self.stamp[last] - self.stamp[first]
+        at_start = known[first]
+        time = self.stamp[last] - self.stamp[first]
         integrated = _integrated(rates, forces, held)
         turned = (at_start.inv() * known[last]).inv() * rotations.from_quat(integrated[0], scalar_first=True)
         errors = [turned.as_rotvec()]
@@ -280,8 +282,7 @@ class MeasuredErrors:
         path = scipy.spatial.transform.Slerp(self.stamp, known)
         before, after = path(edges[:, :-1].ravel()), path(edges[:, 1:].ravel())
         turning = (before.inv() * after).as_rotvec().reshape(rates.shape) / np.where(held > 0, held, 1.0)[..., None]
-        velocity_errors = np.asarray(_integrated(turning, forces, held)[1]) - gained
-        return np.concatenate(errors, axis=1), velocity_errors
+        return np.concatenate(errors, axis=1), np.asarray(_integrated(turning, forces, held)[1]) - gained
 
 
 def steady_stamps(stamp: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> BoolArray:
@@ -454,7 +455,8 @@ def estimator_noise(
     parts = {length: _part(source, noise, length) for length in kept}
     walks = {length: {triad: _walk(part, triad) for triad in INERTIAL_QUANTITIES} for length, part in parts.items()}
     notes += source.notes
-    rng, chosen = np.random.default_rng(seed), kept.index(interval)
+    rng = np.random.default_rng(seed)
+    chosen = kept.index(interval)
     triads = {}
     turned = np.ones(len(kept))
     for triad in _OWN:  # the gyroscope first
@@ -640,7 +642,8 @@ def _multiplier(
 
     turned: the gyroscope's multiplier, in what the accelerometer's stands beside.
     """
-    rows, moment = _OWN[triad], part.moment[triad]
+    rows = _OWN[triad]
+    moment = part.moment[triad]
     if moment is None:
         return None
     white, known = part.noise[triad, "white"][:, rows, rows], walks[triad] ** 2 * part.noise[triad, "1"][:, rows, rows]
@@ -697,7 +700,6 @@ def _solved(square: FloatArray, share: FloatArray) -> FloatArray:
 
 
 def _nees(part: _Length, multipliers: Mapping[str, float], walks: Mapping[str, float]) -> dict[str, float]:
-    """Return the mean NEES of each increment over its three degrees of freedom."""
     assumed = np.sum(
         [
             multipliers[triad] ** 2 * part.noise[triad, "white"] + walks[triad] ** 2 * part.noise[triad, "1"]

@@ -102,13 +102,15 @@ def _step(state: Navigation, sums: _Sums) -> Navigation:
     meridian, across = _radii(sine, height)
     gravity = normal_gravity(sine**2, height) + state.anomaly
     attitude = rotation_rows(state.attitude)
-    pushed, carried = matvec(attitude, sums.velocity), matvec(attitude, sums.position)
+    pushed = matvec(attitude, sums.velocity)
+    carried = matvec(attitude, sums.position)
     earth = [jnp.zeros_like(sine), EARTH_RATE * cosine, EARTH_RATE * sine]
     pushed = _lagging(pushed, earth, time / 2)  # the frame turns meanwhile
     east, north, _ = (v + d / 2 for v, d in zip(state.velocity, pushed, strict=True))
     moving = [-north / meridian, east / across, east * sine / (cosine * across)]
     turning = [(a + b) * time for a, b in zip(earth, moving, strict=True)]
-    pushed, carried = _lagging(pushed, moving, time / 2), _lagging(carried, turning, 1 / 3)
+    pushed = _lagging(pushed, moving, time / 2)
+    carried = _lagging(carried, turning, 1 / 3)
     pushed[2] = pushed[2] - gravity * time
     middle = [v + d / 2 for v, d in zip(state.velocity, pushed, strict=True)]
     coriolis = cross([2 * a + b for a, b in zip(earth, moving, strict=True)], middle)

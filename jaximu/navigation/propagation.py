@@ -30,8 +30,7 @@ def noise_covariance(
         moved = identity if matrix is None else jnp.broadcast_to(matrix, identity.shape)
         push = push.T[:, :, None]
         across = push * system.output[:, None, :]
-        below = jnp.zeros_like(across).swapaxes(-1, -2)
-        whole = jnp.block([[moved, across], [below, system.transition]])
+        whole = jnp.block([[moved, across], [jnp.zeros_like(across).swapaxes(-1, -2), system.transition]])
         drive = jnp.concatenate([push * system.through[:, None, :], system.drive], axis=1)
         covariance = whole @ covariance @ whole.swapaxes(-1, -2) + drive @ drive.swapaxes(-1, -2)
         return covariance, jnp.diagonal(covariance.sum(axis=0))[:size]

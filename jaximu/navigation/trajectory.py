@@ -77,7 +77,8 @@ class Trajectory:
         Raises `NotPossibleError` for one that is too short or too long.
         """
         require_float64()
-        count, total = len(self.intervals), float(np.sum(self.intervals))
+        count = len(self.intervals)
+        total = float(np.sum(self.intervals))
         if count > _MOST:
             raise NotPossibleError(
                 f"the path has {count} samples, and {_MOST} are the most: shorten it with --duration "
@@ -144,16 +145,18 @@ def level_driving(
     """
     time = (np.arange(round(duration * rate)) + 0.5) / rate
     turns = np.arange(_FIRST_TURN, duration, _TURN_EVERY)
-    latitude, gravity = np.radians(site.latitude), site.gravity.value
-    force, turned, attitude = _felt_on_the_road(time, turns, earth_rate(latitude), latitude, gravity)
+    latitude = np.radians(site.latitude)
+    force, turned, attitude = _felt_on_the_road(time, turns, earth_rate(latitude), latitude, site.gravity.value)
     warm = np.full(len(time), float(temperature))
     stimulus = Stimulus(force, turned, time=time, temperature=warm, temperature_rate=0 * warm, attitude=attitude)
     start = _start(np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]), site, site.gravity.value)
-    words = (
+    return Trajectory(
+        start,
+        stimulus,
+        np.full(len(time), 1 / rate),
         f"{duration:g} s of level driving at {site.latitude:g}° latitude: at rest for {_REST:g} s, then up to "
-        f"{_SPEED:g} m/s in {_RISE:g} s, a turn of 90° every {_TURN_EVERY:g} s from {_FIRST_TURN:g} s on"
-    )
-    return Trajectory(start, stimulus, np.full(len(time), 1 / rate), words).cut()
+        f"{_SPEED:g} m/s in {_RISE:g} s, a turn of 90° every {_TURN_EVERY:g} s from {_FIRST_TURN:g} s on",
+    ).cut()
 
 
 @compiled
@@ -226,20 +229,23 @@ def of_recording(recording: Recording, calibration: Calibration, site: Place, du
     ready = compensate(calibration, recording)
     gyroscope, accelerometer = ready.gyroscope, ready.accelerometer
     assert gyroscope is not None
-    time, rate = gyroscope.time, gyroscope.values
+    time = gyroscope.time
+    rate = gyroscope.values
     force = accelerometer.at(time)
     notes = []
     if recording.attitude is not None:
         first = float(recording.attitude.time[0])
-        attitude, gravity = recording.attitude.values[0], site.gravity.value
+        attitude = recording.attitude.values[0]
+        gravity = site.gravity.value
         notes.append("the motion starts at the log's first attitude, and its velocity there is taken as zero.")
     else:
         begin, end = _first_rest(time, force, rate, site.gravity.value, recording.name)
-        first, resting = begin, (time >= begin) & (time <= min(end, begin + _LEVELLED))
+        first = begin
+        resting = (time >= begin) & (time <= min(end, begin + _LEVELLED))
         up = force[resting].mean(axis=0)
-        attitude, gravity = attitude_of(up).as_quat(scalar_first=True), float(np.linalg.norm(up))
-        earth = earth_rate(np.radians(site.latitude))
-        rate = rate - rate[resting].mean(axis=0) + attitude_of(up).inv().apply(earth)
+        attitude = attitude_of(up).as_quat(scalar_first=True)
+        gravity = float(np.linalg.norm(up))
+        rate = rate - rate[resting].mean(axis=0) + attitude_of(up).inv().apply(earth_rate(np.radians(site.latitude)))
         notes.append(f"the motion starts at the log's first rest, {first:.1f} s in, levelled there; heading unknown.")
     kept = (time >= first) & (time < first + duration)
     temperature = ready.temperature
@@ -263,7 +269,8 @@ def _first_rest(
     def means(values: FloatArray) -> FloatArray:
         return np.stack([np.bincount(second, column) for column in values.T], axis=1) / count[:, None]
 
-    force_mean, rate_mean = means(force), means(rate)
+    force_mean = means(force)
+    rate_mean = means(rate)
     spread = np.stack([means(values**2) - mean**2 for values, mean in ((force, force_mean), (rate, rate_mean))])
     still = np.sqrt(np.maximum(spread.sum(axis=-1), 0)) < np.array(_STILL)[:, None]
     level = np.abs(lengths_of(force_mean) - gravity) < _STILL[0]

@@ -113,7 +113,6 @@ _BELOW = 0.1
 
 
 def _of_ready(ready: Sequence[Prepared]) -> NoiseAnalysis:
-    """Return the analysis of recordings that were looked over."""
     findings = [finding for one in ready for finding in one.findings]
     notes = list(dict.fromkeys(finding.text for finding in findings if finding.name not in _OF_ITS_OWN))
     unusable = {finding.refuses for finding in findings if finding.refuses}
@@ -163,7 +162,8 @@ def _of_ready(ready: Sequence[Prepared]) -> NoiseAnalysis:
 
 def _by_temperature(recording: Recording, name: str) -> list[str]:
     """Say how much of what is slow in a sensor's output a straight line of the logged temperature accounts for."""
-    signal, celsius = getattr(recording, name), recording.temperature
+    signal = getattr(recording, name)
+    celsius = recording.temperature
     edges = np.linspace(0, len(signal), _SLOW + 1).astype(int)
     if celsius is None or len(signal) < 2 * _SLOW:
         return []
@@ -186,7 +186,8 @@ def _analysed(
     recordings: Sequence[Recording], longest: Recording, name: str, highest: float | None
 ) -> tuple[list[Identified], float, list[str]]:
     """Return the noise of a triad's axes in the longest recording, up to a frequency (Hz), its rate (Hz), and notes."""
-    what, notes = f"{longest.name}: the {name}", []
+    what = f"{longest.name}: the {name}"
+    notes = []
     values, rate = evenly_sampled(getattr(longest, name), what)
     for recording in recordings:
         if getattr(recording, name) is not None:

@@ -33,8 +33,8 @@ def fit_noise(recording: Recording) -> NoiseModel:
 
 
 def _of_ready(ready: Prepared) -> NoiseModel:
-    """Return the noise of a recording that was looked over."""
-    recording, axes = ready.recording, dict[str, AxisNoise]()
+    recording = ready.recording
+    axes = dict[str, AxisNoise]()
     notes = [finding.text for finding in ready.findings if finding.name not in _OF_ITS_OWN]
     for name in ("accelerometer", "gyroscope"):
         if getattr(recording, name) is None:

@@ -131,7 +131,8 @@ def periodic_lines(
 def without_line(values: FloatArray) -> tuple[FloatArray, float]:
     """Return samples (n,) less the straight line through them, and its slope a sample."""
     samples = len(values)
-    index, centred = np.arange(samples) - (samples - 1) / 2, values - values.mean()
+    index = np.arange(samples) - (samples - 1) / 2
+    centred = values - values.mean()
     slope = 12 * np.dot(index, centred) / (samples * (samples**2 - 1.0))
     return centred - slope * index, float(slope)
 

@@ -144,7 +144,8 @@ def deviation(
     multi = resolution == "multi"
     if multi and kind != "overlapping":
         raise InputError(f"the multi-resolution deviation is the overlapping Allan deviation, not the {kind} one.")
-    rows, samples = data.reshape(-1, data.shape[-1]), data.shape[-1] - phase
+    rows = data.reshape(-1, data.shape[-1])
+    samples = data.shape[-1] - phase
     chosen = averaging_factors(samples, kind) if factors is None else np.unique(np.asarray(factors, np.int64))
     if not len(chosen) or chosen[0] < 1 or chosen[-1] > _longest(samples, kind):
         raise NotPossibleError(
@@ -204,7 +205,6 @@ def _require_sense(data: FloatArray, rate: float, difference: _DeviationKind, ph
 
 
 def _processors() -> int:
-    """Processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -270,13 +270,15 @@ def _mean_squares(
     if kind.total:  # mirrored about both ends; differences are centred on every inner point
         mirrored = points[-2:0:-1]
         points = np.concatenate([2 * points[0] - mirrored, points, 2 * points[-1] - mirrored])
-    square, count = np.zeros(len(grid.factor)), np.zeros(len(grid.factor), np.int64)
+    square = np.zeros(len(grid.factor))
+    count = np.zeros(len(grid.factor), np.int64)
     # short averages need the same points: a block stays in the processor's cache for all of them
     block = _BLOCK if kind.overlapping else len(points)
     for level in np.unique(grid.level):
         chosen = np.flatnonzero(grid.level == level)
         step = 1 << level
-        at_level, missing = np.ascontiguousarray(points[::step]), None if lost is None else lost[::step]
+        at_level = np.ascontiguousarray(points[::step])
+        missing = None if lost is None else lost[::step]
         for start in range(0, len(at_level), block):
             for k in chosen:
                 lag = grid.lag[k]
@@ -321,7 +323,8 @@ def _exponents(points: FloatArray, factors: IntArray) -> IntArray:
 
 def _exponent(ends: FloatArray) -> int:
     """The exponent of the noise by the phase at the ends of averages: differenced until it is no walk."""
-    delta, order = np.inf, 0
+    delta = np.inf
+    order = 0
     for order in range(3):
         correlation = _lag_one(ends, 1 + order)
         delta = correlation / (1 + correlation) if correlation > -1 else -10.0
@@ -368,7 +371,8 @@ def degrees_of_freedom(kind: str, points: int, factor: int, exponent: int, lag: 
         shared = [max(0.0, 1 - k * stride / terms) * (w / middle) ** 2 for k, w in enumerate(others, start=1)]
         return terms / (1 + 2 * sum(shared))
     if stride > _FINE:  # the sum is smooth in its index: as many terms of a coarser grid give the same
-        terms, stride = terms * _FINE / stride, _FINE
+        terms = terms * _FINE / stride
+        stride = _FINE
     highest = int(min(terms, (d + 1) * stride))
     shape = _correlation(d, exponent, filtering, stride, highest)
     j = np.arange(1, highest)

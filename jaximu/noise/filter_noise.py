@@ -132,7 +132,8 @@ class FilterNumbers:
 
     def rows(self) -> list[tuple[str, str, str, float | None, str]]:
         """Return (key, formula, words, value, unit) of every number; value None where the data supports none."""
-        signal, walk = SI_UNITS[self.quantity]["B"], SI_UNITS[self.quantity]["R"]
+        signal = SI_UNITS[self.quantity]["B"]
+        walk = SI_UNITS[self.quantity]["R"]
         integral = SI_UNITS[self.quantity]["Q"]
         word = {"angular_rate": "angle", "specific_force": "velocity"}.get(self.quantity)
         squared = f"({signal})^2"

@@ -110,10 +110,10 @@ class Identified:
         theta = np.array([0.0 if term is None else term.value**2 for term in self.terms.values()])
         variance = _basis(tau * rate, rate, "".join(self.terms)) @ theta
         if self.high_pass is not None:
-            variance = variance - _held_back(tau, rate, dict(zip(self.terms, theta, strict=True)), self.high_pass.value)
+            variance -= _held_back(tau, rate, dict(zip(self.terms, theta, strict=True)), self.high_pass.value)
         for markov in self.gauss_markov:
             process = FirstOrderGaussMarkov.of(markov.sigma.value, markov.correlation_time.value)
-            variance = variance + process.allan_variance(tau)
+            variance += process.allan_variance(tau)
         return np.sqrt(variance)
 
 
@@ -172,12 +172,14 @@ def _identify(
     if highest is not None:
         bands = [*bands, (highest, rate / 2)]
     if periodic is not None:
-        whole, values = whole - periodic, values - periodic
+        whole = whole - periodic
+        values = values - periodic
     spectrum = _spectrum(whole, rate, bands)
     warm_up = _warm_up(spectrum, terms)
     if warm_up is not None:
         drift = warm_up.amplitude * np.exp(-np.arange(len(whole)) / (rate * warm_up.time_constant))
-        whole, values = whole - drift, values - drift
+        whole = whole - drift
+        values = values - drift
         spectrum = _spectrum(whole, rate, bands)
     measured = _deviation(filled(values, BRIDGED), rate, confidence)
     if not (measured.value > 0).all():
@@ -197,9 +199,9 @@ def _identify(
         # octave may then differ from the terms by a share that makes the misfit what it should be.
         excess = _excess(general, freedom)
     best = _select(replace(general.model, excess=excess), offered)
-    result: dict[str, Term | None] = dict.fromkeys(terms)
-    for index, term in enumerate(best.model.letters):
-        result[term] = _term(best, index, threshold)
+    result = dict.fromkeys(terms) | {
+        term: _term(best, index, threshold) for index, term in enumerate(best.model.letters)
+    }
     if best.model.ramp:
         low, high = _ramp_bounds(best, threshold)
         ends = sorted((abs(low), abs(high)))
@@ -247,7 +249,7 @@ def _held_back(tau: FloatArray, rate: float, theta: dict[str, float], time_const
         + theta.get("K", 0.0) / (4 * np.sin(half) ** 2 * rate**2)
         + theta.get("Q", 0.0) * rate * 4 * np.sin(half) ** 2
     )
-    density = density * (1 - _passed(2 * half * rate, time_constant))
+    density *= 1 - _passed(2 * half * rate, time_constant)
     kernel = np.sin(np.pi * frequency * tau[:, None]) ** 4 / (tau[:, None] * rate * np.sin(half)) ** 2
     return np.asarray(4 * np.trapezoid(density * kernel, frequency))
 
@@ -337,8 +339,8 @@ def _binned(coefficient: FloatArray, rate: float, slope: float, bands: Sequence[
     for low, high in bands:
         first, last = (round(2 * samples * f / rate) for f in (low, high))
         keep[max(first, 1) : max(last, 0) + 1] = 0.0
-    count = np.add.reduceat(keep, edges[:-1]) if bands else np.diff(edges).astype(float)
-    sums = np.add.reduceat(np.square(coefficient) * keep if bands else np.square(coefficient), edges[:-1])
+    count = np.add.reduceat(keep, edges[:-1])
+    sums = np.add.reduceat(np.square(coefficient) * keep, edges[:-1])
     used = count > 0
     number = np.where(used, np.cumsum(used) - 1, -1)
     low = min(samples - 1, _RAMPED)
@@ -359,7 +361,8 @@ def _binned(coefficient: FloatArray, rate: float, slope: float, bands: Sequence[
 
 def _column(spectrum: _Spectrum, term: str) -> FloatArray:
     """Mean density (B,) of the coefficients of a term of size one."""
-    rate, half = spectrum.rate, spectrum.angle / 2
+    rate = spectrum.rate
+    half = spectrum.angle / 2
     if term == "Q":  # a second difference matrix but for its corners, which add the two ends
         density = rate * (4 * np.sin(half) ** 2 + 4 / spectrum.samples * np.cos(half) ** 2)
     elif term == "N":
@@ -456,7 +459,8 @@ class _Model:
     @cached_property
     def gram(self) -> FloatArray:
         """Means (B, drifts, drifts) of products of the regressors."""
-        rows, size = self.regressors, len(self.regressors)
+        rows = self.regressors
+        size = len(self.regressors)
         products = [self.spectrum.products(a, b) for a in rows for b in rows]
         return np.reshape(products, (size, size, len(self.spectrum.count))).T
 
@@ -466,7 +470,8 @@ class _Model:
         parts = [self.columns * np.exp(theta[:count])]
         for i in range(len(self.times)):
             log_variance, log_time = theta[count + 2 * i : count + 2 * i + 2]
-            spectrum, step = self.spectrum, 1e-4
+            spectrum = self.spectrum
+            step = 1e-4
             below, above = (_markov(spectrum, np.exp(log_time + s)) @ _WEIGHT for s in (-step, step))
             parts.append(np.exp(log_variance) * np.stack([(below + above) / 2, (above - below) / (2 * step)], axis=1))
         shares = np.concatenate(parts, axis=1)
@@ -505,7 +510,8 @@ class _Model:
     def solve(self, theta: FloatArray, held: int | None = None, ramp: float | None = None) -> _Fit:
         """Maximise the likelihood by Fisher scoring; `held`: a parameter that stays, `ramp`: the ramp's size if so."""
         free = np.array([i for i in range(len(theta)) if i != held], np.int64)
-        damping, theta = 1e-3, theta.copy()
+        damping = 1e-3
+        theta = theta.copy()
 
         def evaluate(at):
             variance, shares = self.variance(at)
@@ -580,7 +586,8 @@ class _Fit:
 
     def misfit(self) -> tuple[float, int]:
         """χ² (the deviance of each octave's mean ratio) and its degrees of freedom."""
-        weight, octave = self.model.weight, self.model.spectrum.octave
+        weight = self.model.weight
+        octave = self.model.spectrum.octave
         total = np.bincount(octave, weight)
         mean = np.bincount(octave, weight * self.ratio)[total > 0] / total[total > 0]
         total = total[total > 0]
@@ -593,8 +600,7 @@ def _times(spectrum: _Spectrum, terms: str, count: int) -> tuple[float, ...]:
     times: tuple[float, ...] = ()
     grid = np.geomspace(2 / spectrum.rate, spectrum.samples / spectrum.rate / 6, 16)
     for _ in range(count):
-        fits = [_Model(spectrum, terms, (*times, time)).fit() for time in grid]
-        best = min(fits, key=lambda fit: fit.loss)
+        best = min([_Model(spectrum, terms, (*times, time)).fit() for time in grid], key=lambda fit: fit.loss)
         times = tuple(np.exp(best.theta[len(best.model.letters) + 1 :: 2]).tolist())
     return times
 
@@ -647,7 +653,7 @@ def _bounds(fit: _Fit, index: int, threshold: float) -> tuple[float, float]:
     spread = min(np.sqrt(inverse[index, index]) / scale[index], 3.0)
     # a variance known from few coefficients, 2 spread⁻² of them: −2 log L scatters more than χ² (M. S. Bartlett,
     # Proc. R. Soc. A 160, 1937)
-    threshold = threshold * (1 + spread**2 / 6)
+    threshold *= 1 + spread**2 / 6
     return _ends(lambda at: fit.held(index, at) - threshold, fit.theta[index], spread, threshold)
 
 
@@ -722,10 +728,9 @@ def _high_pass(general: _Fit, threshold: float) -> Term | None:
         def rise(distance: float) -> float:
             return loss(middle + sign * distance) - fit.loss - threshold
 
-        return sign * _root(rise, 0.0, float(np.ptp(grid)), 1e-3)
+        return middle + sign * _root(rise, 0.0, float(np.ptp(grid)), 1e-3)
 
-    low, high = end(-1), end(1)
-    return Term(*np.exp([middle, middle + low, middle + high]).tolist())
+    return Term(*np.exp([middle, end(-1), end(1)]).tolist())
 
 
 def _around_least(grid: FloatArray, losses: Sequence[float]) -> tuple[float, float]:
@@ -740,18 +745,14 @@ def _warm_up(spectrum: _Spectrum, terms: str) -> WarmUp | None:
     The likelihood without it has all of white noise, flicker, walk and ramp at its disposal, and both count octaves as
     little as the fit with the drift says they may be trusted.
     """
-    terms = terms + "".join(term for term in "NBKR" if term not in terms)
+    terms += "".join(term for term in "NBKR" if term not in terms)
     duration = spectrum.samples / spectrum.rate
     without = _Model(spectrum, terms).fit()
     grid = np.geomspace(max(20 / spectrum.rate, duration / 2000), duration / 2, 14)
-    kept, inside = spectrum.inside >= 0, spectrum.inside
-    low = np.where(kept, (without.by_variance / spectrum.count)[inside], 0.0)
+    low = np.where(spectrum.inside >= 0, (without.by_variance / spectrum.count)[spectrum.inside], 0.0)
     rest = spectrum.coefficient - without.sizes[0] * spectrum.ramp()
-    gains = []
-    for time in grid:  # at the variance without it: an upper bound is not needed to see that there is nothing
-        row = spectrum.decay(time)
-        gains.append((low @ (rest * row)) ** 2 / (low @ row**2))
-    if max(gains) < 5:
+    # at the variance without it: an upper bound is not needed to see that there is nothing
+    if max((low @ (rest * row)) ** 2 / (low @ row**2) for row in map(spectrum.decay, grid)) < 5:
         return None
 
     def loss(logarithm: float) -> float:

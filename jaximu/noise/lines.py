@@ -143,7 +143,8 @@ def _of_axis(parts: FloatArray, times: FloatArray, rate: float, axis: int) -> li
     total = np.sum(np.hanning(width + 1))
     if not np.all(noise[:, lobe:] > 1e-20 * np.mean(parts**2)):
         return []
-    ordinates, points = power / noise, _OVER * width
+    ordinates = power / noise
+    points = _OVER * width
     fold = np.minimum(np.arange(points), points - np.arange(points))
     gaps = np.diff(times) * rate / width
     hidden = np.zeros(ordinates.shape, bool)
@@ -164,8 +165,7 @@ def _of_axis(parts: FloatArray, times: FloatArray, rate: float, axis: int) -> li
         at = fold[course % points]
         visible = odds[strength, window, at] > 0
         frequency = course * rate / points
-        near = np.abs(np.arange(odds.shape[2]) - at[:, None]) <= lobe
-        steady = np.where(near, odds, 0.0).sum(axis=1).max()
+        steady = np.where(np.abs(np.arange(odds.shape[2]) - at[:, None]) <= lobe, odds, 0.0).sum(axis=1).max()
         size = _size(tapered / total, frequency, times, rate, noise[window, at] / total**2, visible)
         lines.append(SpectralLine(axis, times, frequency, visible, size, rate, rate / width, whole, float(steady)))
         hidden |= _covered(ordinates, at)
@@ -188,8 +188,10 @@ def _beside(power: FloatArray) -> FloatArray:
         spans = np.lib.stride_tricks.sliding_window_view(scaled, span, axis=1).swapaxes(0, 1)
         return np.quantile(spans.reshape(len(spans), -1), _QUARTILE, axis=1) / factor
 
-    beside, last = usual(side), power.shape[1]
-    index, first = np.arange(last), 2 * lobe + side
+    beside = usual(side)
+    last = power.shape[1]
+    index = np.arange(last)
+    first = 2 * lobe + side
     below, above = index - lobe - side, np.minimum(index + lobe + 1, last - 1)
     after = np.where(above <= last - side, beside[np.minimum(above, last - side)], 0.0)
     shape = np.maximum(beside[np.maximum(below, 0)], after)
@@ -212,7 +214,7 @@ def _forward(odds: FloatArray, gaps: FloatArray) -> FloatArray:
         top = odds[:, index].max(axis=1)[:, None]
         belief = belief * np.exp(odds[:, index] - top)[:, None]
         mass = belief.sum(axis=2)
-        belief = belief / mass[:, :, None]
+        belief /= mass[:, :, None]
         total += np.log(mass) + top
     return total
 
@@ -220,7 +222,8 @@ def _forward(odds: FloatArray, gaps: FloatArray) -> FloatArray:
 def _likeliest(odds: FloatArray, gaps: FloatArray, drift: float, walk: float) -> IntArray:
     """Return the likeliest course (k,) on the grid, not folded, of a drift and a walk; `odds` (k, n): logarithms."""
     points = odds.shape[1]
-    score, steps = odds[0], []
+    score = odds[0]
+    steps = []
     for gap, gain in zip(gaps, odds[1:], strict=True):
         shift, spread = _OVER * drift * gap, _OVER * walk * np.sqrt(gap)
         step = round(shift) + np.arange(-int(4 * spread) - 1, int(4 * spread) + 2)
@@ -279,7 +282,8 @@ def swing(values: FloatArray, time: FloatArray, line: SpectralLine) -> tuple[flo
     centred = time - time.mean()
     length = len(time) * (time[1] - time[0])
     drift, middle = np.polyfit(centred, np.interp(time, line.times, line.frequency), 1)
-    hidden, half_range = _LOBE * line.resolution, _OFF / length
+    hidden = _LOBE * line.resolution
+    half_range = _OFF / length
     if np.abs(middle - line.rate * np.round(middle / line.rate)) < hidden:
         half_range = max(half_range, hidden)
     offsets, bends = np.meshgrid(

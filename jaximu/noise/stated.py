@@ -53,7 +53,8 @@ def sensor_noise(document: Mapping[str, Any], name: str) -> SensorNoise:
         axes = document.get(triad)
         if axes is None:
             continue
-        units, terms = SI_UNITS[quantity], {}
+        units = SI_UNITS[quantity]
+        terms = {}
         with damage(name):
             for term in ("Q", "N", "B", "K"):
                 entries = [axis["terms"].get(term) for axis in axes]

@@ -171,8 +171,7 @@ class Budget(Result, Document, page="budget"):
 
     def nonlinear(self) -> list[tuple[int, int]]:
         """Return (source, parameter) where the first order is off by more than 5 % of the total."""
-        wrong = (np.abs(self.off) > _OFF) & self.determined
-        return [(int(row), int(column)) for row, column in np.argwhere(wrong)]
+        return [(int(row), int(column)) for row, column in np.argwhere((np.abs(self.off) > _OFF) & self.determined)]
 
     def order(self) -> list[int]:
         """Return the sources, dominant first: by their mean share of the parameters' variances."""
@@ -237,24 +236,24 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
     roots = np.concatenate([source.root for source in sources], axis=1)
     scattered = np.moveaxis((moved * used) @ roots, 2, 1).reshape(len(design), -1)
     excess, jacobian = _expected_excess(np.asarray(design), scattered, np.asarray(units), stations)
-    by_means = np.asarray(_sensitivity(stations, start, parameters, excess)).reshape(len(names), -1)
+    fixed = stations, start, parameters, excess
+    by_means = np.asarray(_sensitivity(*fixed)).reshape(len(names), -1)
     truth = _truth(scheme, start, names)
     slope = scale[:, None] * (by_means @ moved.reshape(by_means.shape[1], -1)) - truth
     sigma = np.stack([lengths_of(slope @ source.root) for source in sources])
 
-    errors = [_paired(source) for source in sources]
+    # draws and their negatives: what is odd in them then averages out of what is even
+    halves = [source.draw(np.random.default_rng(0), _DRAWS // 2) for source in sources]
+    errors = [np.concatenate([half, -half]) for half in halves]
     means = _recorded(scheme, np.concatenate(errors))
-    fixed = stations, start, parameters, excess
     solved = scale * in_chunks(lambda rows: stored.call(_lanes, "budget solutions", *fixed, rows), _CHUNK, means)
     solved -= np.concatenate(errors) @ truth.T
-    parts = zip(sigma, errors, np.split(solved, len(errors)), strict=True)
     actual = np.stack(
         [
             root_or_zero(linear**2 + _mean_square(whole) - _mean_square(drawn @ slope.T))
-            for linear, drawn, whole in parts
+            for linear, drawn, whole in zip(sigma, errors, np.split(solved, len(errors)), strict=True)
         ]
     )
-
     protocol = task.case.protocol
     result = Budget(
         task.name,
@@ -324,12 +323,6 @@ def _sessions(scheme: ErrorScheme, both):
     return jax.lax.map(lambda pair: jnp.stack(jax.jvp(scheme.means, (pair[0],), (pair[1],))), both)
 
 
-def _paired(source: ErrorSource) -> FloatArray:
-    """Draws of a source and their negatives: what is odd in them then averages out of what is even."""
-    half = source.draw(np.random.default_rng(0), _DRAWS // 2)
-    return np.concatenate([half, -half])
-
-
 def _expected_excess(
     design: FloatArray, scattered: FloatArray, units: FloatArray, stations: Stations
 ) -> tuple[FloatArray, FloatArray]:
@@ -350,7 +343,8 @@ def _expected_excess(
         inverse = weights.T @ weights - basis.T @ basis
         gradient = units @ (((inverse @ scattered) ** 2).sum(axis=1) - np.diagonal(inverse))
         information = units @ inverse**2 @ units.T
-        before, excess = excess, np.asarray(scored(excess, gradient, information))
+        before = excess
+        excess = np.asarray(scored(excess, gradient, information))
         if (np.abs(excess - before) <= 1e-4 * (1 + before)).all():
             break
     return excess, whitening(np.zeros(len(units))) @ design
@@ -390,7 +384,8 @@ def _check(
 
 def _truth(scheme: ErrorScheme, unit: Imu, names: Sequence[Name]) -> FloatArray:
     """How the true values of the parameters (p) depend on the errors (n): an effect that is fitted is to follow."""
-    truth, first = np.zeros((len(names), sum(scheme.sizes))), sum(scheme.sizes[:2])
+    truth = np.zeros((len(names), sum(scheme.sizes)))
+    first = sum(scheme.sizes[:2])
     for effect in scheme.effects:
         same = [key for key, fitted in unit.all_effects().items() if fitted.name == effect.name]
         for row, name in enumerate(names):
@@ -401,7 +396,6 @@ def _truth(scheme: ErrorScheme, unit: Imu, names: Sequence[Name]) -> FloatArray:
 
 
 def _recorded(scheme: ErrorScheme, errors: FloatArray) -> FloatArray:
-    """Return the mean outputs (N, 2, S, 3) of sessions with these errors (N, n)."""
     small = scheme.simulated
     wrong = errors[:, :small]
     return _simulated(scheme, np.stack([wrong, np.zeros_like(wrong)], axis=1))[:, 0] + _added(errors[:, small:])
@@ -433,7 +427,8 @@ def _goal(result: Budget, what: str, text: str) -> Goal:
     worst = indices[int(total.argmax())]
     names = tuple(result.names[index] for index in indices)
     reached = bool(total.max() <= size)
-    alone, together = (), None
+    alone = ()
+    together = None
     if not reached and np.isfinite(total).all():
         ranked = sorted(range(len(result.sources)), key=lambda row: -result.sigma[row, worst])
         ranked = [row for row in ranked if np.any(result.sigma[row, indices] > 1e-3 * size)]

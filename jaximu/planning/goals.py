@@ -41,8 +41,7 @@ def unit_of(name: Name, unit: Imu) -> str:
     """Return the unit of a parameter's standard deviation, gains being relative to their axis's scale."""
     if name.effect is not None:
         triad = unit.triads().get(name.owner)
-        effect = unit.all_effects()[name.key]
-        return effect.coefficient_unit("SI" if triad is None else triad.output_unit)
+        return unit.all_effects()[name.key].coefficient_unit("SI" if triad is None else triad.output_unit)
     if name.part == "bias":
         return SENSOR_UNITS[name.owner]
     return "1" if name.is_scale else "rad"

@@ -143,7 +143,6 @@ class Guide:
         )
 
     def _renew(self, recording: Recording) -> None:
-        """Calibrate what there is, and choose the next orientation."""
         if len(self._seen) >= _FEWEST:
             try:
                 self._calibration = calibrate(recording, self.gravity)
@@ -171,7 +170,6 @@ class Guide:
         self._next = _BOX[np.argmin(left)]
 
     def _unit(self, recording: Recording) -> Imu:
-        """Return the unit as it is known by now."""
         return as_stated(recording) if self._calibration is None else self._calibration.imu
 
     def _left(self, question: DesignQuestion, information: FloatArray, cosine: float) -> float:
@@ -189,7 +187,8 @@ class Guide:
         return float(np.log(total))
 
     def _goals(self, recording: Recording) -> list[GoalProgress]:
-        progress, calibration = [], self._calibration
+        progress = []
+        calibration = self._calibration
         for text, what, size in self.goals:
             if calibration is None:
                 progress.append(GoalProgress(text, 0.0, np.inf))
@@ -203,8 +202,7 @@ class Guide:
 def _upward(imu: Imu, signal: Signal, rows: IntArray) -> FloatArray:
     """Return the body's mean upward directions (n, 3) over spans of rows (n, 2)."""
     means = np.array([signal.values[first:last].mean(axis=0) for first, last in rows]).reshape(-1, 3)
-    gain, bias = np.asarray(imu.accelerometer.gain), np.asarray(imu.accelerometer.bias)
-    force = np.linalg.solve(gain, (means - bias).T).T
+    force = np.linalg.solve(np.asarray(imu.accelerometer.gain), (means - np.asarray(imu.accelerometer.bias)).T).T
     return force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-12)
 
 

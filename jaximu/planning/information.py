@@ -104,7 +104,8 @@ def _plain(imu: Imu) -> Imu:
 
 def _observed(imu: Imu, attitude, accuracy: Accuracy, gravity) -> Observations:
     """What a unit would put out, without noise, held in attitudes and turned from each to the next."""
-    count, vectors = len(attitude), turn_vectors(attitude)
+    count = len(attitude)
+    vectors = turn_vectors(attitude)
     steps = len(vectors), SAMPLES
     middle = (jnp.arange(SAMPLES) + 0.5) / SAMPLES
     during = multiply(
@@ -193,7 +194,8 @@ def table_information(
     turns = len(design.rate), SAMPLES
     course = design.rate[:, None] * accuracy.turn * (jnp.arange(SAMPLES) + 0.5) / SAMPLES
     during = multiply(exponential(course[..., None] * UP), jnp.broadcast_to(design.axis[:, None], (*turns, 4)))
-    up, axis = up_vectors(design.attitude), jnp.broadcast_to(up_vectors(design.axis)[:, None], (*turns, 3))
+    up = up_vectors(design.attitude)
+    axis = jnp.broadcast_to(up_vectors(design.axis)[:, None], (*turns, 3))
     at_rest = Stimulus(gravity * up, jnp.zeros_like(up), attitude=design.attitude)
     moving = Stimulus(gravity * axis, design.rate[:, None, None] * axis, attitude=during)
 
@@ -235,7 +237,8 @@ def _reported(imu: Imu, design: Design, accuracy: Accuracy, gravity, count: int)
     samples = _SPLIT * count + 1
     step = whole / samples
     edges = step * jnp.arange(samples + 1)
-    stood, middle = at(edges), at(edges[:-1] + step / 2)
+    stood = at(edges)
+    middle = at(edges[:-1] + step / 2)
     rate = logarithm(multiply(conjugate(stood[:-1]), stood[1:])) / step
     force, turning = imu.respond(Stimulus(gravity * up_vectors(middle), rate, attitude=middle))
     assert turning is not None

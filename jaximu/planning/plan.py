@@ -146,7 +146,8 @@ class Known:
         if observations is None:
             return replace(known, excess=_left_over(calibration))
         poses, turns = observations.poses, observations.turns
-        poses, noise = part_of(poses, np.asarray(poses.mask)), np.asarray(turns.noise)
+        poses = part_of(poses, np.asarray(poses.mask))
+        noise = np.asarray(turns.noise)
         turned = np.asarray(turns.interval)[np.asarray(turns.mask)]
         density = np.mean(poses.accelerometer_covariance * (poses.stop - poses.start)[:, None, None], axis=0)
         # variances as traces: the next rests and turns have other durations, their excess is the same
@@ -356,7 +357,8 @@ def propose(
     exact, design, best, classical = _searched(question, poses, turns, equipment, seed, report)
     if classical:
         notes += ("well known positions do as well as any here, and are proposed.",)
-    names, size = question.parameters.names, question.parameters.size
+    names = question.parameters.names
+    size = question.parameters.size
     prior = np.linalg.inv(question.prior) + np.outer(question.by_gravity, question.by_gravity)
     # what the data sheet adds is none of the data's: it must not hide a direction that no pose tells
     root = root_of(best.information + question.prior - np.eye(len(size)) / TOLERANCE**2)
@@ -367,7 +369,7 @@ def propose(
     return Proposal(
         equipment,
         parameter or criterion,
-        _poses(design, equipment),
+        tuple(Pose(up_of(attitude), attitude, _words(attitude, equipment)) for attitude in design.attitude),
         _turns(design, equipment),
         question.imu,
         names,
@@ -464,11 +466,11 @@ def _coarsened(question: DesignQuestion) -> DesignQuestion:
 
 def _plannable(imu: Imu) -> tuple[Imu, tuple[str, ...]]:
     """The unit with its effects dormant, but for those that poses and turns do not excite or that do not last."""
-    dormant, notes = [], []
+    dormant = []
+    notes = []
     for effect in (effect for triad in imu.triads().values() for effect in triad.effects):
         if effect.scope == "device" and set(effect.needs) <= set(STIMULI) and not effect.memory:
-            inner = {key: getattr(effect, key) for key in effect.inner}
-            dormant.append(CATALOGUE[effect.name].dormant(**inner))
+            dormant.append(CATALOGUE[effect.name].dormant(**{key: getattr(effect, key) for key in effect.inner}))
         else:
             notes.append(f"{effect.title} is left as it is: poses and turns at one temperature do not determine it.")
     return on_host(imu.with_effects(*dormant)), tuple(notes)
@@ -479,7 +481,8 @@ def _in_output(triad: Triad, density: FloatArray) -> FloatArray:
 
 
 def _accuracy(known: Known, imu: Imu, equipment: Equipment) -> tuple[Accuracy, tuple[str, ...]]:
-    notes, densities = [], []
+    notes = []
+    densities = []
     figures = {
         "accelerometer": (ACCELEROMETER_DENSITY, "100 µg/√Hz", known.accelerometer_noise),
         "gyroscope": (GYROSCOPE_DENSITY, "0.005 °/s/√Hz", known.gyroscope_noise),
@@ -504,10 +507,12 @@ def _accuracy(known: Known, imu: Imu, equipment: Equipment) -> tuple[Accuracy, t
 
 def _prior(known: Known, imu: Imu, parameters: Parameters, by_gravity: FloatArray) -> FloatArray:
     """Information (typical sizes) about the parameters, gravity known: the calibration's, else the data sheet's."""
-    names, size = parameters.names, parameters.size
+    names = parameters.names
+    size = parameters.size
     total = TOLERANCE**2 * np.eye(len(names))
     if known.covariance is not None:
-        upper, by_hand = [index for index, name in enumerate(names) if name in _UPPER], _is_by_hand(known.names)
+        upper = [index for index, name in enumerate(names) if name in _UPPER]
+        by_hand = _is_by_hand(known.names)
         covariance = known.covariance
         if not upper and not by_hand and set(_UPPER) <= set(known.names):
             covariance = _in_hand_frame(covariance, known.names, imu)
@@ -549,7 +554,8 @@ def _frame(imu: Imu, names: Sequence[Name]) -> FloatArray:
 
 def _in_hand_frame(covariance: FloatArray, names: Sequence[Name], imu: Imu) -> FloatArray:
     """A table's covariance in the frame in which the accelerometer's gain is lower triangular."""
-    frame, upper = _frame(imu, names), [names.index(name) for name in _UPPER]
+    frame = _frame(imu, names)
+    upper = [names.index(name) for name in _UPPER]
     turned = np.eye(len(names))
     turned[:, upper] -= frame @ np.linalg.inv(frame[upper])
     return turned @ covariance @ turned.T
@@ -588,7 +594,8 @@ def _starts(poses: int, turns: int, equipment: Equipment, seed: int) -> list[Des
 
     def design(up: FloatArray, heading: FloatArray, axis: FloatArray) -> Design:
         sign = np.where(np.arange(turns) // 3 % 2, -1.0, 1.0)  # about three axes one way, then the other
-        attitude, axes = _attitudes(up, heading), _attitudes(axis, np.zeros(turns))
+        attitude = _attitudes(up, heading)
+        axes = _attitudes(axis, np.zeros(turns))
         attitude = _neighbourly(attitude) if equipment.chained else attitude
         return Design(attitude, axes, np.radians(equipment.fastest) * sign)
 
@@ -621,7 +628,8 @@ def _neighbourly(attitudes: FloatArray) -> FloatArray:
 
 
 def _rounded(design: Design, equipment: Equipment) -> Design:
-    step, attitude = np.radians(equipment.step), design.attitude
+    step = np.radians(equipment.step)
+    attitude = design.attitude
     if equipment.chained:
         zero = first_heading(attitude[0]) if equipment.by_hand else 0.0
         round_ = np.array([round_attitude(quaternion, step, zero) for quaternion in attitude])
@@ -636,12 +644,7 @@ def _rounded(design: Design, equipment: Equipment) -> Design:
     return Design(up, axis, np.radians(np.degrees(design.rate).round(0)))
 
 
-def _poses(design: Design, equipment: Equipment) -> tuple[Pose, ...]:
-    return tuple(Pose(up_of(attitude), attitude, _words(attitude, equipment)) for attitude in design.attitude)
-
-
 def _words(attitude: FloatArray, equipment: Equipment) -> str:
-    """Return how the unit is to lie; a robot is told the heading, too."""
     if equipment.by_hand:
         return attitude_words(attitude)
     tilt = pose_words(up_of(attitude))

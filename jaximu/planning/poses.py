@@ -17,7 +17,8 @@ def up_of(attitude: FloatArray) -> FloatArray:
 def turned_to(attitude: FloatArray, up: FloatArray) -> FloatArray:
     """Return the attitude (4,) that is reached from another (4,) by the shortest turn that brings `up` (3,) upwards."""
     before = up_of(attitude)
-    cross, cosine = np.cross(before, up), float(before @ up)
+    cross = np.cross(before, up)
+    cosine = float(before @ up)
     size = float(np.linalg.norm(cross))
     axis = cross / size if size > 1e-9 else np.roll(before, 1)
     # the body turns by −angle about this axis for the level frame's up to come from `before` to `up`
@@ -98,7 +99,8 @@ def short_order(up: FloatArray) -> IntArray:
             for last in range(first + 1, len(order)):
                 other = order[:first] + order[first : last + 1][::-1] + order[last + 1 :]
                 if length(other) < length(order) - 1e-9:
-                    order, improved = other, True
+                    order = other
+                    improved = True
     return np.array(order)
 
 
@@ -110,9 +112,11 @@ def _lifted(azimuth: float, j: str, k: str) -> str:
     """Name the side, corner or edge of a level box that lies in a direction, counted from axis j towards axis k."""
     quarter, rest = divmod(azimuth, np.pi / 2)
     if np.pi / 2 - rest < 1e-9:
-        quarter, rest = quarter + 1, 0.0
+        quarter = quarter + 1
+        rest = 0.0
     names = [f"+{j}", f"+{k}", f"−{j}", f"−{k}"]
-    side, following = names[int(quarter) % 4], names[int(quarter + 1) % 4]
+    side = names[int(quarter) % 4]
+    following = names[int(quarter + 1) % 4]
     if rest < 1e-9:
         return f"{side} side"
     if abs(rest - np.pi / 4) < 1e-9:

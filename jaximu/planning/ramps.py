@@ -70,7 +70,8 @@ def next_ramps(blocks: RestBlocks) -> tuple[dict[str, Separation], tuple[Ramp, .
 def _with(blocks: RestBlocks, ends: Sequence[float], rate: float) -> tuple[RestBlocks, float]:
     """Return the blocks with those of one more recording, straight ways with a soak at each end, and its length, s."""
     steps = abs(ends[1] - ends[0]) / rate * np.tile([_SOAK, 1.0], len(ends))[: 2 * len(ends) - 1]
-    knots, count = np.cumulative_sum(steps, include_initial=True), _BLOCKS * (len(ends) - 1)
+    knots = np.cumulative_sum(steps, include_initial=True)
+    count = _BLOCKS * (len(ends) - 1)
     edges = np.linspace(0.0, knots[-1], 8 * count + 1)
     time = midpoints(edges)
     path = np.interp(time, knots, np.repeat(ends, 2))

@@ -116,8 +116,7 @@ def _rival(diagnosis: Diagnosis, cause: Named, name: str) -> Effect:
     others = [other.name for other in diagnosis.effects if other.name != cause.name]
     indices = [best(wanted) for wanted in (name, *others) if any(block.name == wanted for block in evidence.blocks)]
     block = evidence.blocks[indices[0]]
-    coefficients = evidence.coefficients(indices)[: len(block.sizes)] * block.sizes
-    return CATALOGUE[name].make(coefficients, **block.inner)
+    return CATALOGUE[name].make(evidence.coefficients(indices)[: len(block.sizes)] * block.sizes, **block.inner)
 
 
 def _candidates(diagnosis: Diagnosis, effects: Sequence[Effect]) -> Iterator[tuple[str, Protocol, Environment]]:
@@ -129,7 +128,8 @@ def _candidates(diagnosis: Diagnosis, effects: Sequence[Effect]) -> Iterator[tup
     middle = middle if logged is None else float(np.mean(logged.values))
     warm = any("temperature" in need for need in needs)
     level = Environment(gravity=gravity, temperature=None if logged is None else middle)
-    plain, long = TurnedByHand(_POSES), TurnedByHand(2 * _POSES)
+    plain = TurnedByHand(_POSES)
+    long = TurnedByHand(2 * _POSES)
     if warm or "time" in needs:
         for protocol, cycles, times in ((plain, 1, "up and down again"), (long, 2, "up and down twice")):
             length = protocol.poses * (protocol.pose_duration + protocol.turn_duration)
@@ -153,7 +153,8 @@ def _candidates(diagnosis: Diagnosis, effects: Sequence[Effect]) -> Iterator[tup
 
 
 def _experiment(diagnosis: Diagnosis, protocol: Protocol, environment: Environment, imu: Imu) -> Experiment:
-    noise, gravity = diagnosis.noise, diagnosis.calibration.gravity.value
+    noise = diagnosis.noise
+    gravity = diagnosis.calibration.gravity.value
     rate = round(diagnosis.experiment.recordings[0].accelerometer.rate, 3)
     silent, truth = simulate(imu, protocol, rate=rate, seed=1, environment=environment)
     recording = _noisy(silent, noise)
@@ -167,15 +168,16 @@ def _experiment(diagnosis: Diagnosis, protocol: Protocol, environment: Environme
 def _noisy(recording: Recording, noise: NoiseModel) -> Recording:
     changed = {}
     for number, name in enumerate(("accelerometer", "gyroscope")):
-        signal, known = getattr(recording, name), getattr(noise, name)
-        drawn = drawn_noise(known, len(signal), signal.rate, [1, number]) * signal.nominal_scale
+        signal = getattr(recording, name)
+        drawn = drawn_noise(getattr(noise, name), len(signal), signal.rate, [1, number]) * signal.nominal_scale
         changed[name] = replace(signal, values=signal.values + drawn)
     return replace(recording, **changed)
 
 
 def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict[str, float]:
     """By rival of the first effect: the least power, either way, to rule the one out if the other is there."""
-    linear, used = experiment.linearise(imu), experiment.used
+    linear = experiment.linearise(imu)
+    used = experiment.used
     root = np.linalg.cholesky(submatrix(linear.covariance, used))
     base = _basis(np.linalg.solve(root, linear.slope[used]))
     kinds = [type(effect) for effect in effects]
@@ -212,5 +214,4 @@ def _basis(columns: NDArray[np.floating]) -> FloatArray:
 
 
 def _detected(noncentrality: float, freedom: int, level: float) -> float:
-    bound = chi2_isf(level, freedom)
-    return float(noncentral_chi2_sf(bound, freedom, max(noncentrality, 1e-12)))
+    return float(noncentral_chi2_sf(chi2_isf(level, freedom), freedom, max(noncentrality, 1e-12)))

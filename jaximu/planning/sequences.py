@@ -115,7 +115,8 @@ class Filter:
 
     def begun(self) -> Knowledge:
         """Return what is known before the first rest."""
-        start, states = first_knowledge(self.errors, np.zeros(3), len(self.prior.right)), self.errors.states
+        start = first_knowledge(self.errors, np.zeros(3), len(self.prior.right))
+        states = self.errors.states
         start.root[states:, states:], start.right[states:] = self.prior.root, self.prior.right
         return start
 
@@ -144,7 +145,8 @@ class Filter:
         """
         measurement, _ = self.measured(words)
         rows, start = self._rows(measurement, slice(0, int(np.sum(measurement.intervals.real))))
-        initial, states = self.begun(), self.errors.states
+        initial = self.begun()
+        states = self.errors.states
         if not known:
             free = [index for index, name in enumerate(self.names) if index not in self.earth]
             initial.root[states:, states:][free] = 0.0
@@ -176,7 +178,8 @@ class Filter:
 
     def _headed(self, rows: WhiteRows, ahead: Rotation) -> WhiteRows:
         """Return rows of a path turned about the vertical: its heading is by chance, the Earth's rotation is not."""
-        shared, earth = np.array(rows.shared), list(self.earth)
+        shared = np.array(rows.shared)
+        earth = list(self.earth)
         shared[..., earth] = shared[..., earth] @ ahead.as_matrix().T
         return rows._replace(shared=shared)
 
@@ -200,8 +203,7 @@ def filter_of(
     """Return the filter of a unit and notes on what had to be assumed; arguments as in [`propose_sequence`]."""
     chosen = [state_effect(effect_named(effect)) for effect in effects]
     chosen = [effect for effect in chosen if effect.name != GyroEarthRotation.name]
-    plain = replace(known, imu=known.imu.with_effects())
-    question, notes = question_of(plain, equipment, "D", None)
+    question, notes = question_of(replace(known, imu=known.imu.with_effects()), equipment, "D", None)
     if noise is None:
         gains = [np.linalg.inv(np.asarray(triad.gain)) for triad in question.imu.triads().values()]
         densities = np.asarray(question.accuracy.accelerometer) * equipment.rest, np.asarray(question.accuracy.density)
@@ -227,7 +229,6 @@ def filter_of(
     information[-1, -1] = 1 / max(known.gravity.sigma, 1e-6) ** 2
     scale = sigmas_of(information)
     root = np.linalg.cholesky(information / np.outer(scale, scale)).T * scale
-    prior = Knowledge(root, np.zeros(len(root)))
     return Filter(
         imu,
         disturbances(noise),
@@ -237,7 +238,7 @@ def filter_of(
         free.names,
         size,
         np.asarray(free.index, int),
-        prior,
+        Knowledge(root, np.zeros(len(root))),
         NEIGHBOURS if chosen else 0,
     ), notes
 
@@ -338,9 +339,11 @@ def _proposal(
     source: str,
     notes: tuple[str, ...],
 ) -> Proposal:
-    start, size = estimator.begun(), estimator.size
+    start = estimator.begun()
+    size = estimator.size
     before, after = (np.asarray(estimator.numbers(stage)) for stage in (start, knowledge))
-    states, earth = estimator.errors.states, list(estimator.earth)
+    states = estimator.errors.states
+    earth = list(estimator.earth)
     root = estimator.whole(words, known=False).root[states:, states:]
     # gravity's column comes last, so that the rows above it hold without it only where it is known
     information = root.T @ root
@@ -382,7 +385,8 @@ def _proposal(
 
 def _poses_and_turns(words: Sequence[str], equipment: Equipment) -> tuple[tuple[Pose, ...], tuple[Turn, ...]]:
     """The positions that rotations lead through, z up first, and the turns between them."""
-    attitude, turns = _UPRIGHT, []
+    attitude = _UPRIGHT
+    turns = []
 
     def stand(attitude: Rotation) -> Pose:
         quaternion = attitude.as_quat(scalar_first=True)
@@ -392,7 +396,7 @@ def _poses_and_turns(words: Sequence[str], equipment: Equipment) -> tuple[tuple[
     for word in words:
         vector = rotation_vector(word)
         angle = float(np.linalg.norm(vector))
-        attitude = attitude * Rotation.from_rotvec(vector)
+        attitude *= Rotation.from_rotvec(vector)
         poses.append(stand(attitude))
         turn_words = f"{np.degrees(angle):.0f}° about {'+' if vector.sum() > 0 else '−'}{word[0]}"
         turns.append(Turn(vector / angle, angle, angle / equipment.turn, turn_words))

@@ -188,7 +188,8 @@ def _errors(table: Any, name: str, environment: Mapping[str, Any]) -> Json:
         else:
             effects = [effect for effect, kind in CATALOGUE.items() if kind.owner in INERTIAL_QUANTITIES]
             for effect, stated in only(value, effects, name, "[errors.truncated]").items():
-                entry, kind = f"{where}.{effect}", CATALOGUE[effect]
+                entry = f"{where}.{effect}"
+                kind = CATALOGUE[effect]
                 unit = kind.coefficient_unit(SENSOR_UNITS[kind.owner])
                 sizes = stated if isinstance(stated, list) else [stated] * kind.size
                 if len(sizes) != kind.size:
@@ -231,8 +232,7 @@ class ErrorScheme(eqx.Module):
     @property
     def sizes(self) -> tuple[int, int, int, int]:
         """How many errors of each kind."""
-        coefficients = sum(effect.size for effect in self.effects)
-        return 1, 3 * self.stops, coefficients, 6 * self.stations.turn.shape[0]
+        return 1, 3 * self.stops, sum(effect.size for effect in self.effects), 6 * self.stations.turn.shape[0]
 
     @property
     def simulated(self) -> int:
@@ -243,7 +243,8 @@ class ErrorScheme(eqx.Module):
         """Return what the unit goes through where stations begin `delay` (s) and its attitude is off by `turned` at the
         stops, and between in proportion to how much of a turn is done.
         """
-        stations, nodes = self.stations, self.done.shape[1]
+        stations = self.stations
+        nodes = self.done.shape[1]
         step = jnp.where(stations.stop > stations.start, stations.stop - stations.start, 1.0) / nodes
         edges = stations.start[:, None] + delay + step[:, None] * jnp.arange(nodes + 1)
         edge = self.motion.attitude_at(edges.ravel()).reshape(*edges.shape, 4)
@@ -299,7 +300,8 @@ def _stops(intervals: tuple[ScheduleEntry, ...], motion: Motion) -> _Stops:
     segment = np.searchsorted(motion.start, [interval.start + 1e-9 for interval in intervals], side="right") - 1
     begin = [Rotation.from_quat(motion.attitude[row], scalar_first=True) for row in segment]
     up = []
-    setting, ends = [], []
+    setting = []
+    ends = []
     last: Rotation | None = None
 
     def stop(attitude: Rotation, new: bool) -> None:
@@ -319,7 +321,8 @@ def _stops(intervals: tuple[ScheduleEntry, ...], motion: Motion) -> _Stops:
 
 def _attitude_roots(stops: _Stops, kind: str) -> dict[str, FloatArray]:
     """How unit draws of each kind of error turn the unit at the stops: (3 A, k)."""
-    count, settings = len(stops.up), int(stops.setting.max()) + 1
+    count = len(stops.up)
+    settings = int(stops.setting.max()) + 1
     member = stops.setting[:, None] == np.arange(settings)  # (A, settings)
     across = np.eye(3) - stops.up[:, :, None] * stops.up[:, None, :]
     about = np.eye(count)[:, None, :] * stops.up[:, :, None]  # (A, 3, A)
@@ -330,13 +333,11 @@ def _attitude_roots(stops: _Stops, kind: str) -> dict[str, FloatArray]:
     level = np.hypot(stops.up[:, 0], stops.up[:, 1]) < 1e-9
     azimuth = np.where(level, 0.0, np.arctan2(stops.up[:, 1], stops.up[:, 0]))
     turned = Rotation.from_euler("z", azimuth[:, None])
-    zero = np.zeros(count)
-    tilting = turned.apply(np.stack([np.cos(polar), zero, -np.sin(polar)], axis=1))
-    spindle = turned.apply([1.0, 0.0, 0.0])
+    tilting = turned.apply(np.stack([np.cos(polar), np.zeros(count), -np.sin(polar)], axis=1))
     roots = {
         "angle_setting": about if kind in _TURN_ONLY else np.concatenate([about, others], axis=2),
         "mounting": mounting,
-        "orthogonality": np.stack([tilting, spindle], axis=2),
+        "orthogonality": np.stack([tilting, turned.apply([1.0, 0.0, 0.0])], axis=2),
     }
     return {name: np.asarray(root.reshape(3 * count, -1), np.float64) for name, root in roots.items()}
 
@@ -441,7 +442,8 @@ def _with_noise(case: Case, stations: Stations, intervals: Sequence[ScheduleEntr
     bias, zero where not used; rate ramps (3,), SI, by triad; notes.
     """
     span = times_of(intervals)
-    count, size = len(span), stations.turn.shape[0]
+    count = len(span)
+    size = stations.turn.shape[0]
     notes, ramps, fast, slow = [], {}, np.zeros((6, size, size)), np.zeros((6, size, size))
     used = {"accelerometer": stations.accelerometer_used, "gyroscope": stations.gyroscope_used}
     for number, (name, triad) in enumerate(case.imu.triads().items()):
@@ -509,7 +511,8 @@ def _scheme(
     stops: _Stops,
     errors: StatedErrors,
 ) -> ErrorScheme:
-    count, size = len(intervals), stations.turn.shape[0]
+    count = len(intervals)
+    size = stations.turn.shape[0]
     ends, axis, angle = np.zeros((size, 2), np.int64), np.zeros((size, 3)), np.full(size, np.inf)
     ends[:count], axis[:count] = stops.ends, [interval.vector for interval in intervals]
     angle[:count] = [interval.angle if interval.kind == "turn" else np.inf for interval in intervals]

@@ -125,7 +125,6 @@ def unseen_notes(axes: Sequence[Identified], quantity: str) -> list[str]:
 
 
 def _hours(seconds: float) -> str:
-    """Return a duration as a person says it."""
     if seconds < 120:
         return f"{seconds:.3g} s"
     return f"{seconds / 60:.3g} min" if seconds < 7200 else f"{seconds / 3600:.3g} h"
@@ -139,7 +138,6 @@ def _shown(analysis: NoiseAnalysis) -> Iterator[tuple[str, str, dict[str, Term]]
 
 
 def _verdict(analysis: NoiseAnalysis) -> Iterator[str]:
-    """Say of each triad what a person should keep."""
     start = f"In {_hours(recorded_seconds(next(iter(analysis.axes.values()))[0]))} at rest, the"
     for name, quantity, terms in _shown(analysis):
         sizes = [f"{TERM_NAMES[term]} of {_in_unit(mean.value, quantity, term)}" for term, mean in terms.items()]
@@ -148,7 +146,6 @@ def _verdict(analysis: NoiseAnalysis) -> Iterator[str]:
 
 
 def _number(analysis: NoiseAnalysis) -> tuple[str, str]:
-    """Return the first term of the most important triad that shows one, and what it is."""
     for name, quantity, terms in _shown(analysis):
         for term, mean in terms.items():
             low, high = (_in_unit(end, quantity, term) for end in (mean.low, mean.high))
@@ -170,11 +167,6 @@ def _lowest(axes: Sequence[Identified]) -> tuple[float, float]:
 
 def _mean_deviation(axes: Sequence[Identified], tau: FloatArray) -> FloatArray:
     return np.sqrt(np.mean([axis.allan_deviation(tau) ** 2 for axis in axes], axis=0))
-
-
-def _line(term: str, value: float, tau: FloatArray) -> FloatArray:
-    """Return the Allan deviation of one term alone (SI)."""
-    return np.sqrt(TERM_PROCESSES[term](value).allan_variance(tau))
 
 
 def allan_figure(analysis: NoiseAnalysis) -> Figure:
@@ -211,7 +203,8 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
     quantity = SENSOR_QUANTITIES[name]
     factor = _factor(quantity, "B", unit)
     tau = axes[0].deviation.tau
-    longest, length = tau[-1], max(recorded_seconds(axes[0]), 2 * tau[-1])
+    longest = tau[-1]
+    length = max(recorded_seconds(axes[0]), 2 * tau[-1])
     fine = np.geomspace(tau[0], longest, 200)
     for colour, fit in zip(AXES.values(), axes, strict=True):
         deviation = fit.deviation
@@ -235,7 +228,7 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
     for term, mean in mean_terms(axes).items():
         if mean is None:
             continue
-        line = factor * _line(term, mean.value, whole)
+        line = factor * np.sqrt(TERM_PROCESSES[term](mean.value).allan_variance(whole))
         panel.plot(whole, line, "--", color="0.3", linewidth=0.9, zorder=2.5)
         _letter(panel, term, whole, line, total, bottom, top)
     panel.axvspan(longest, right, color="0.88", zorder=1)
@@ -276,7 +269,6 @@ def _letter(
     spot, align = end, "left" if room else "right"  # beside a line that leaves at the bottom
     if end < 12 or end > len(tau) - 12:  # on a line that leaves at the side
         spot, align = (8, "left") if end < 12 else (len(tau) - 8, "right")
-    box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
     panel.annotate(
         f" {term}  {TERM_NAMES[term]} ",
         (tau[spot], line[spot]),
@@ -285,12 +277,13 @@ def _letter(
         zorder=5,
         ha=align,
         va="center",
-        bbox=box,
+        bbox={"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
     )
 
 
 def _headline(name: str, axes: Sequence[Identified]) -> str:
-    quantity, white = SENSOR_QUANTITIES[name], mean_terms(axes).get("N")
+    quantity = SENSOR_QUANTITIES[name]
+    white = mean_terms(axes).get("N")
     at, size = _lowest(axes)
     bottom = f"lowest {_in_unit(size, quantity, 'B', 2)} at {number(at, 2)} s"
     first = "" if white is None else f"N = {_in_unit(white.value, quantity, 'N')}, "
@@ -376,23 +369,24 @@ def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
 
 
 def _cautions(analysis: NoiseAnalysis) -> Section:
-    """Say where the terms are not the whole noise, and which sensor is missing."""
     poor = [name for name, axes in analysis.axes.items() if any(axis.excess for axis in axes)]
     missing = [name for name in INERTIAL_QUANTITIES if name not in {*analysis.axes, *analysis.unusable}]
     cautions = []
     if poor:
-        text = (
-            f"The five terms do not describe the {listed(poor)} completely; the intervals are widened for it, see the "
-            "notes."
+        cautions.append(
+            Statement(
+                "More than the five terms",
+                f"The five terms do not describe the {listed(poor)} completely; the intervals are widened for it, see "
+                "the notes.",
+                True,
+            )
         )
-        cautions.append(Statement("More than the five terms", text, True))
     if missing:
         cautions.append(Statement("Not recorded", f"The recording has no {listed(missing, 'and no')}.", True))
     return Section("Before you rely on it", cautions)
 
 
 def _by_triad(analysis: NoiseAnalysis, title: str, text: str, content: _Content) -> Section:
-    """Return a section with a part for each triad."""
     return Section(
         title,
         [
@@ -406,8 +400,8 @@ def _by_triad(analysis: NoiseAnalysis, title: str, text: str, content: _Content)
 
 
 def _terms(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
-    """Yield a triad's terms with their intervals, in both units, what is not seen, and the lowest point."""
-    axes, quantity = analysis.axes[name], SENSOR_QUANTITIES[name]
+    axes = analysis.axes[name]
+    quantity = SENSOR_QUANTITIES[name]
     rows = [row.row(f"{row.term} {row.meaning}", row.first) for row in term_rows(axes, quantity)]
     yield Table(("term", "unit", *_AXES), rows)
     yield from unseen_notes(axes, quantity)
@@ -416,7 +410,6 @@ def _terms(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
 
 
 def _terms_in_si(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
-    """Yield a triad's terms in SI with their intervals, which the first screen has no room for."""
     quantity = SENSOR_QUANTITIES[name]
     rows = [
         replace(row, first=True).row(f"{row.term} {row.meaning}")
@@ -427,13 +420,11 @@ def _terms_in_si(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
 
 
 def _filter(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
-    """Yield the numbers that a filter takes of the mean of a triad's axes."""
     rows = [row for row in _filter_rows(filter_numbers(analysis, name)[1]) if row[2]]
     yield Table(("formula", "number", "value", "unit"), rows) or _NONE
 
 
 def _limits(analysis: NoiseAnalysis) -> Iterator[Part]:
-    """Say what the length of the recording does not resolve, and how the bias differs between recordings."""
     triads = {}
     for name, axes in analysis.axes.items():
         text = (
@@ -445,24 +436,18 @@ def _limits(analysis: NoiseAnalysis) -> Iterator[Part]:
     yield Section(
         "What the length cannot resolve", [Statement(sentence(listed(names)), text) for text, names in triads.items()]
     )
-    parts: list[Part] = [
-        "One recording does not show how the bias changes from power-on to power-on, and the Allan deviation cannot "
-        "see it. Give several recordings of the unit, lying alike: `jaximu allan LOG1 LOG2 LOG3 …`"
-    ]
-    if analysis.repeatability:
-        text = (
-            f"Standard deviation of the bias over {len(analysis.files)} recordings, with its 95 % interval. No Allan "
-            "deviation sees it, and a filter needs it as the bias's standard deviation at the start."
-        )
-        parts = [
-            text,
-            Table(("sensor", "unit", *_AXES[:3]), [row.row(row.meaning) for row in _repeatability_rows(analysis)]),
-        ]
-    yield Section("Repeatability", parts)
+    text = (
+        f"Standard deviation of the bias over {len(analysis.files)} recordings, with its 95 % interval. No Allan "
+        "deviation sees it, and a filter needs it as the bias's standard deviation at the start."
+        if analysis.repeatability
+        else "One recording does not show how the bias changes from power-on to power-on, and the Allan deviation "
+        "cannot see it. Give several recordings of the unit, lying alike: `jaximu allan LOG1 LOG2 LOG3 …`"
+    )
+    rows = [row.row(row.meaning) for row in _repeatability_rows(analysis)]
+    yield Section("Repeatability", [text, Table(("sensor", "unit", *_AXES[:3]), rows)])
 
 
 def _details(analysis: NoiseAnalysis, sources: Sequence[Source]) -> Iterator[Part]:
-    """Yield what a program needs: numbers at the sample rate and by axis, Kalibr's file; and where it comes from."""
     yield _by_triad(analysis, "The terms in SI, with intervals", "", _terms_in_si)
     yield _by_triad(
         analysis,
@@ -505,7 +490,6 @@ def _details(analysis: NoiseAnalysis, sources: Sequence[Source]) -> Iterator[Par
 
 
 def _discrete(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
-    """Yield the standard deviations of a triad's samples and steps, in two units."""
     axes, quantity, rate = analysis.axes[name], SENSOR_QUANTITIES[name], analysis.rates[name]
     rows = []
     for term, words in (("N", "white noise of one sample, σ = N √rate"), ("K", "step of the bias walk, σ = K/√rate")):
@@ -519,7 +503,6 @@ def _discrete(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
 
 
 def _filter_by_axis(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
-    """Yield the numbers that a filter takes of each axis of a triad, and where B rules."""
     per_axis, mean = filter_numbers(analysis, name)
     rows = [
         (row[0][0], row[0][3], *(text or "–" for _, _, text, _ in row))
@@ -543,7 +526,6 @@ def _filter_rows(numbers: FilterNumbers) -> list[tuple[str, str, str, str]]:
 
 
 def _repeatability_rows(analysis: NoiseAnalysis) -> list[TermRow]:
-    """Return how the bias scatters over recordings, by triad: a row in the unit of data sheets, then one in SI."""
     rows = []
     for name, table in analysis.repeatability.items():
         quantity = SENSOR_QUANTITIES[name]

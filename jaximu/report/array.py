@@ -48,7 +48,6 @@ def page_of(array: Array) -> Page:
 
 
 def _next(array: Array) -> str:
-    """Say how to find why a unit disturbs, or how to apply the first unit's calibration."""
     for unit, *_ in array.suspects():
         return f"`jaximu diagnose {shlex.quote(unit.name)} -o RESULTS` looks for the cause of its scatter."
     log = shlex.quote(array.units[0].name)
@@ -56,7 +55,6 @@ def _next(array: Array) -> str:
 
 
 def _suspects(array: Array) -> Iterator[Statement]:
-    """Say which units scatter far more than the others."""
     for unit, words, times in array.suspects():
         yield Statement(
             Path(unit.name).name,
@@ -69,7 +67,6 @@ def _suspects(array: Array) -> Iterator[Statement]:
 
 
 def _noise(array: Array) -> Iterator[Statement]:
-    """Say what averaging gains at rest, beside what it would if the units' noises were independent."""
     for (unit, mean, expected), words, factor, printed in (
         (array.averaged.rate, "gyroscope", np.degrees(1.0), "°/s"),
         (array.averaged.force, "accelerometer", 1e3, "mm/s²"),
@@ -82,7 +79,6 @@ def _noise(array: Array) -> Iterator[Statement]:
 
 
 def _table(array: Array) -> Table:
-    """Return how each unit is turned and placed, how late its clock is, and its scatter; suspects are marked."""
     suspects = [unit for unit, *_ in array.suspects()]
     marked = [index for index, unit in enumerate(array.units) if any(unit is suspect for suspect in suspects)]
     return Table(
@@ -96,7 +92,6 @@ def _table(array: Array) -> Table:
 
 
 def _row(unit: ArrayUnit, first: bool) -> tuple[str, ...]:
-    """Return a unit's row, with 95 % intervals."""
     position = ", ".join(
         with_interval(1e3 * value, 1e3 * sigma) for value, sigma in zip(unit.position, unit.position_sigma, strict=True)
     )
@@ -138,7 +133,6 @@ def _figure(array: Array) -> Figure:
 
 
 def _draw(panel, unit: ArrayUnit, across: int, up: int, length: float, named: bool) -> None:
-    """Draw a unit's place and axes; `named`: with the axes' names."""
     centre, width = 1e3 * unit.position, 1.96e3 * unit.position_sigma
     panel.errorbar(centre[across], centre[up], width[up], width[across], color="0.45", linewidth=1.0, zorder=1)
     axes = scipy.spatial.transform.Rotation.from_quat(unit.rotation, scalar_first=True).as_matrix()

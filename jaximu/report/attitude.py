@@ -51,7 +51,8 @@ def mounting_words(calibration: Calibration) -> Iterator[str]:
     drift = 1e6 * (alignment["clock_scale"] - 1)
     if drift:
         yield (f"The log's clock runs {abs(drift):.3g} ppm {'fast' if drift > 0 else 'slow'} against the reference's.")
-    wide, sigma = alignment["filter"]["variance"], alignment["filter"]["sigma"]
+    wide = alignment["filter"]["variance"]
+    sigma = alignment["filter"]["sigma"]
     most, least = (1e3 * np.sqrt(max(abs(wide) + times * Z95 * sigma, 0.0)) for times in (1, -1))
     if least and wide > 0:
         yield f"The reference is smoothed as by a first-order lag of {least:.3g} to {most:.3g} ms (95 %)."
@@ -67,8 +68,7 @@ def mounting_words(calibration: Calibration) -> Iterator[str]:
             f"{1e3 * value:.3g} ± {1.96e3 * sigma:.2g}" for value, sigma in zip(arm["value"], arm["sigma"], strict=True)
         )
         yield f"The unit lies {places} mm (95 %) from the point that is tracked, along the reference's x, y, z."
-    tilt = np.linalg.norm(Mounting.of(calibration.imu).tilt)
-    yield f"The reference's vertical is off by {np.degrees(tilt):.2g}°."
+    yield f"The reference's vertical is off by {np.degrees(np.linalg.norm(Mounting.of(calibration.imu).tilt)):.2g}°."
 
 
 def share_words(calibration: Calibration) -> list[str]:

@@ -32,7 +32,6 @@ def page_of(attribution: Attribution) -> Page:
 
 
 def _verdict(attribution: Attribution) -> Iterator[str]:
-    """Say what belongs to what, the most reaching first."""
     texts = [_sentence(finding, attribution) for finding in attribution.findings if finding.name != COMMON_DRIFT]
     if attribution.common:
         sessions = _names("session", [drift.session for drift in attribution.common], attribution.sessions)
@@ -55,14 +54,12 @@ def _verdict(attribution: Attribution) -> Iterator[str]:
 
 
 def _names(noun: str, names: Sequence[str], every: Sequence[str]) -> str:
-    """Return units or sessions in words."""
     if len(names) == len(every):
         return f"all {noun}s"
     return f"{noun}{'s' * (len(names) > 1)} {listed(list(names))}"
 
 
 def _sentence(finding: Attributed, attribution: Attribution) -> str:
-    """Say what a finding belongs to."""
     title = sentence(effect_title(finding.name))
     if finding.belongs_to == "unit":
         return f"{title} belongs to {_names('unit', finding.units, attribution.units)}: it repeats over the sessions."
@@ -73,7 +70,6 @@ def _sentence(finding: Attributed, attribution: Attribution) -> str:
 
 
 def _first(attribution: Attribution) -> Iterator[Part]:
-    """Return the picture of common time courses, the tables, and what a common cause could be."""
     if attribution.drifts:
         yield Picture(
             "attribution",
@@ -82,7 +78,22 @@ def _first(attribution: Attribution) -> Iterator[Part]:
             "Coloured: the common time course of each session, in a usual axis. Grey: each axis that has a part in it, "
             "less what follows orientation, divided by its part; where grey follows the line, the course is common.",
         )
-    yield _findings_table(attribution)
+    yield Table(
+        ("finding", "belongs to", "units", "sessions", "share", "p-value"),
+        [
+            (
+                f"common drift ({COMMON_DRIFT})" if finding.name == COMMON_DRIFT else effect_title(finding.name),
+                finding.belongs_to,
+                _names("unit", finding.units, attribution.units),
+                _names("session", finding.sessions, attribution.sessions),
+                f"{100 * finding.share:.0f} %",
+                probability(finding.p_value).removeprefix("= "),
+            )
+            for finding in attribution.findings
+        ],
+        "Share: of the squares of all recordings' estimates, weighted with their information; of a common drift, of "
+        "the variance of all axes. p: that the part is not there, beside scatter from recording to recording.",
+    )
     yield _verdicts_table(attribution)
     if attribution.common:
         yield Statement(
@@ -107,32 +118,7 @@ def _look_alikes(attribution: Attribution) -> Iterator[Statement]:
             )
 
 
-def _findings_table(attribution: Attribution) -> Table:
-    """Return what each finding belongs to."""
-    return Table(
-        ("finding", "belongs to", "units", "sessions", "share", "p-value"),
-        [
-            (
-                _title(finding),
-                finding.belongs_to,
-                _names("unit", finding.units, attribution.units),
-                _names("session", finding.sessions, attribution.sessions),
-                f"{100 * finding.share:.0f} %",
-                probability(finding.p_value).removeprefix("= "),
-            )
-            for finding in attribution.findings
-        ],
-        "Share: of the squares of all recordings' estimates, weighted with their information; of a common drift, of "
-        "the variance of all axes. p: that the part is not there, beside scatter from recording to recording.",
-    )
-
-
-def _title(finding: Attributed) -> str:
-    return f"common drift ({COMMON_DRIFT})" if finding.name == COMMON_DRIFT else effect_title(finding.name)
-
-
 def _verdicts_table(attribution: Attribution) -> Table:
-    """Return the verdict of each recording, units down and sessions across."""
     cells = {
         (part.unit, part.session): f"{_short(part.diagnosis)}\nχ² {number(part.chi2_heldout, 3)}"
         + " *" * part.without_drift
@@ -160,7 +146,6 @@ def _short(diagnosis: dict) -> str:
 
 
 def _drift_figure(attribution: Attribution) -> Figure:
-    """Draw the common time course of each session, and each axis scaled by its part in it."""
     drifts: Sequence[CommonDrift] = attribution.drifts
     factor, unit = readable("rad/s", max(drift.size for drift in drifts))
     figure, grid = figures.stacked(len(drifts), 2.0, 1.0, sharex=True, sharey=True)

@@ -36,7 +36,13 @@ def page_of(budget: Budget) -> Page:
                 "standard deviation (1σ). Independent errors add by their squares, so halving a source removes three "
                 "quarters of its part.",
             ),
-            _goals(budget),
+            Section(
+                "Goals",
+                [
+                    Statement(f"{goal.name} to {_wanted(goal)}", sentence(goal_words(budget, goal)), not goal.reached)
+                    for goal in budget.goals
+                ],
+            ),
             Section(
                 "Sources, dominant first",
                 [Table(("source", "size (1σ)", "mean share of the variances", "most of"), source_rows(budget))],
@@ -49,19 +55,7 @@ def page_of(budget: Budget) -> Page:
     )
 
 
-def _goals(budget: Budget) -> Section:
-    """Return each goal with the sizes that would reach it."""
-    return Section(
-        "Goals",
-        [
-            Statement(f"{goal.name} to {_wanted(goal)}", sentence(goal_words(budget, goal)), not goal.reached)
-            for goal in budget.goals
-        ],
-    )
-
-
 def _parameters(budget: Budget) -> Section:
-    """Return each parameter's standard deviation and what it is made of; those that are not determined are marked."""
     drawn = ("by Monte Carlo",) * (budget.check is not None)
     rows = [
         (words, sigma, *([simulated] if drawn else []), made)
@@ -82,7 +76,6 @@ def _parameters(budget: Budget) -> Section:
 
 
 def _limits(budget: Budget) -> Section:
-    """Return where the first order is not enough, how it compares with simulated sessions, and what stays open."""
     parts: list[Part] = [Statement("Not linear", text, caution=True) for text in nonlinear_words(budget)]
     if budget.check is not None:
         parts.append(Statement("Against simulated sessions", check_words(budget, budget.check)))
@@ -101,11 +94,12 @@ def amount(value: float, unit: str) -> str:
 
 def _reading_order(budget: Budget) -> list[int]:
     """Scales, misalignments and biases of each triad together."""
-    kinds = {unit: rank for rank, unit in enumerate(("1", "rad", "m/s^2", "rad/s"))}
+    kinds = ["1", "rad", "m/s^2", "rad/s"]
 
     def key(index: int):
         name = budget.names[index]
-        return name.owner, kinds.get(budget.units[index], len(kinds)) if name.effect is None else len(kinds)
+        unit = budget.units[index]
+        return name.owner, kinds.index(unit) if name.effect is None and unit in kinds else len(kinds)
 
     return sorted(range(len(budget.names)), key=key)
 
@@ -116,9 +110,9 @@ def shares(budget: Budget) -> FloatArray:
 
 
 def _verdict(budget: Budget) -> Iterator[str]:
-    """Say whether the goals are reached, and which sources dominate how many parameters."""
     if budget.goals:
-        reached, count = sum(goal.reached for goal in budget.goals), len(budget.goals)
+        reached = sum(goal.reached for goal in budget.goals)
+        count = len(budget.goals)
         if count == 1:
             yield f"The goal is {'' if reached else 'not '}reached."
         else:
@@ -154,7 +148,6 @@ def _number(budget: Budget) -> tuple[str, str]:
 
 
 def _total(budget: Budget, goal: Goal) -> float:
-    """Return the standard deviation of a goal's worst parameter."""
     return float(budget.total[budget.names.index(goal.worst)])
 
 
@@ -171,7 +164,6 @@ def _stated(size: str) -> str:
 
 
 def _next(budget: Budget) -> str:
-    """Say what to run: again with better sources, with simulated sessions, or the calibration."""
     source = shlex.quote(budget.source)
     if not all(goal.reached for goal in budget.goals):
         return f"improve the set-up in the specification and run `jaximu budget {source}` once more."
@@ -182,10 +174,12 @@ def _next(budget: Budget) -> str:
 
 def parameter_rows(budget: Budget) -> list[tuple[str, ...]]:
     """Return each parameter in words, its 1σ, what it is made of (dominant first), and its 1σ by Monte Carlo."""
-    part, off = shares(budget), budget.nonlinear()
+    part = shares(budget)
+    off = budget.nonlinear()
     rows = []
     for index in _reading_order(budget):
-        words, unit = describe(budget.names[index], budget.imu), budget.units[index]
+        words = describe(budget.names[index], budget.imu)
+        unit = budget.units[index]
         if not budget.determined[index]:
             rows.append((words, "not determined", "", ""))
             continue
@@ -200,7 +194,8 @@ def parameter_rows(budget: Budget) -> list[tuple[str, ...]]:
 
 def source_rows(budget: Budget) -> list[tuple[str, ...]]:
     """Return each source, dominant first: in words, its size, its mean share, and the parameter it has most of."""
-    part, known = shares(budget), np.flatnonzero(budget.determined)
+    part = shares(budget)
+    known = np.flatnonzero(budget.determined)
     rows = []
     for row in budget.order():
         source = budget.sources[row]
@@ -289,10 +284,10 @@ def _compared(ratio: float) -> str:
 
 
 def _figure(budget: Budget) -> Figure:
-    """Draw each parameter's variance as a bar divided among its sources."""
     owners = [name.owner for name in budget.names]
     columns = [group for group in _GROUPS if group in owners]
-    part, order = shares(budget), budget.order()
+    part = shares(budget)
+    order = budget.order()
     visible = [row for row in order if (part[row, budget.determined] >= LEAST_SHARE).any()][: len(PALETTE)]
     stacked = [(budget.sources[row].words, part[row], color) for row, color in zip(visible, PALETTE, strict=False)]
     if others := [row for row in order if row not in visible]:
@@ -301,8 +296,8 @@ def _figure(budget: Budget) -> Figure:
     if len(columns) > 2:
         figure.set_figwidth(figure.get_figwidth() * 1.35)
     for axes, group in zip(figure.subplots(1, len(columns), squeeze=False)[0], columns, strict=True):
+        dressed(axes, _GROUPS[group])
         _draw_bars(axes, budget, [index for index in _reading_order(budget) if owners[index] == group], stacked)
-        axes.set_title(_GROUPS[group], loc="left", fontsize=11, fontweight="bold")
     legend_below(figure, figure.axes[0], 4)
     dominant = budget.sources[order[0]].words if order else "nothing"
     figure.suptitle(
@@ -313,7 +308,8 @@ def _figure(budget: Budget) -> Figure:
 
 def _draw_bars(axes: Axes, budget: Budget, places: list[int], stacked: list[tuple[str, FloatArray, str]]) -> None:
     known = budget.determined[places]
-    rows, left = np.arange(len(places)), np.zeros(len(places))
+    rows = np.arange(len(places))
+    left = np.zeros(len(places))
     for label, share, color in stacked:
         width = np.where(known, 100 * share[places], 0.0)
         axes.barh(rows, width, left=left, height=0.72, color=color, edgecolor="white", linewidth=0.6, label=label)
@@ -324,7 +320,7 @@ def _draw_bars(axes: Axes, budget: Budget, places: list[int], stacked: list[tupl
         axes.text(102 if known[row] else 2, row, text if known[row] else "not determined", va="center", fontsize=8.5)
     names = [budget.names[index] for index in places]
     note = "   (*: not linear)" if curved & set(places) else ""
-    dressed(axes, xlim=(0, 135), ylim=(len(places) - 0.4, -0.6), xticks=[0, 25, 50, 75, 100])
+    axes.set(xlim=(0, 135), ylim=(len(places) - 0.4, -0.6), xticks=[0, 25, 50, 75, 100])
     axes.set_xlabel(f"share of the variance (%); right: 1σ{note}", fontsize=9)
     axes.set_yticks(rows, [describe(name, budget.imu).removeprefix(f"{name.owner} ") for name in names], fontsize=8.5)
     axes.grid(False)

@@ -60,8 +60,8 @@ def _pictures(calibration: Calibration) -> Iterator[Picture]:
 
 
 def _stations_figure(calibration: Calibration) -> Figure:
-    """Draw each station's errors after calibration, by axis, with the standard deviation of its mean."""
-    fit, stations = calibration.fit, calibration.stations
+    fit = calibration.fit
+    stations = calibration.stations
     assert fit is not None and stations is not None
     panels = [panel for panel in station_errors(fit.imu, stations, np.asarray(fit.excess)) if len(panel.station)]
     figure, grid = figures.stacked(len(panels), 2.3, 0.0)
@@ -140,7 +140,6 @@ def _error_words(name: str) -> str:
 
 
 def _errors(calibration: Calibration) -> Iterator[str]:
-    """Say how large each kind of error was and is."""
     for name, (before, after, unit) in calibration.rms.items():
         if name in calibration.exact:
             yield (
@@ -152,7 +151,6 @@ def _errors(calibration: Calibration) -> Iterator[str]:
 
 
 def _number(calibration: Calibration) -> tuple[str, str]:
-    """Return the first kind of error after calibration, and what it is."""
     if calibration.exact or not calibration.rms:
         return "not checked", "there are as many parameters as conditions"
     name, (before, after, unit) = next(iter(calibration.rms.items()))
@@ -162,8 +160,8 @@ def _number(calibration: Calibration) -> tuple[str, str]:
 
 
 def _determined(calibration: Calibration) -> Iterator[str]:
-    """Say what the data determine, and what a diagnosis found."""
-    count, undetermined = len(calibration.names), sum(not direction.determined for direction in calibration.weak)
+    count = len(calibration.names)
+    undetermined = sum(not direction.determined for direction in calibration.weak)
     if undetermined:
         what = f"{counted(undetermined, 'combination')} of the {count} parameters"
         yield f"The recording does not determine {what} (marked *)."
@@ -176,7 +174,6 @@ def _determined(calibration: Calibration) -> Iterator[str]:
 
 
 def _parameters(calibration: Calibration) -> Iterator[Part]:
-    """Return a table of gain and bias for each triad, and one of what else was fitted."""
     parts = []
     for name, triad in calibration.triads().items():
         rows = tables.rows(calibration, name, triad)
@@ -227,7 +224,6 @@ def _effect_row(parameter: Parameter) -> tuple[str, str]:
 
 
 def _equations(calibration: Calibration) -> Iterator[Part]:
-    """Return the equation to apply, in numbers and as code."""
     parts: list[Part] = [
         "The sensor's output is `y = K·u + b`, with the true input u in SI units. To correct a recording, turn it "
         "round: `u = K⁻¹·(y − b)`."
@@ -253,7 +249,6 @@ def _correlation(calibration: Calibration) -> Picture:
 
 
 def _origin(calibration: Calibration) -> Iterator[Part]:
-    """Return the recording, its files and how it was fitted."""
     parts = []
     if calibration.segmentations:
         parts.append(

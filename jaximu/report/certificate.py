@@ -29,13 +29,18 @@ def page_of(acceptance: Acceptance) -> Page:
     items = sorted(acceptance.items, key=lambda item: (item.verdict != FAIL, item.verdict == PASS))
     counts = Counter(item.verdict for item in items)
     serial = f", serial number {acceptance.serial}" if acceptance.serial else ""
+    table = Table(
+        ("quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"),
+        [tuple(row[column] for column in _COLUMNS[:5]) for row in map(item_row, items)],
+        marked=[index for index, item in enumerate(items) if item.verdict != PASS],
+    )
     return Page(
         f"Acceptance of {Path(acceptance.file).name}{serial}",
         tuple(_verdict(acceptance.verdict, items)),
         acceptance.verdict.capitalize(),
         ", ".join(f"{counts[verdict]} {verdict}" for verdict in (PASS, FAIL, UNDECIDED))
         + f" of {counted(len(items), 'item')}",
-        (Section("Results", [_results(items), *_remarks(items), *_rule(acceptance)]),),
+        (Section("Results", [table, *_remarks(items), *_rule(acceptance)]),),
         lambda: [_uncertainty(items)],
         acceptance.notes,
         _next(acceptance),
@@ -45,7 +50,8 @@ def page_of(acceptance: Acceptance) -> Page:
 
 def certificate_of(acceptance: Acceptance, calibration: Calibration) -> Page:
     """Return the page of a verdict as the certificate of a unit of which nothing is `missing`."""
-    page, trace = page_of(acceptance), acceptance.trace or {}
+    page = page_of(acceptance)
+    trace = acceptance.trace or {}
     stated = trace["certificate"]
     facts = provenance(calibration)
     return replace(
@@ -61,15 +67,13 @@ def certificate_of(acceptance: Acceptance, calibration: Calibration) -> Page:
 
 
 def _verdict(verdict: str, items: Sequence[Item]) -> Iterator[str]:
-    """Yield what decides: the items that fail, else those that are undecided, with value and limits."""
     deciding = [item for item in items if item.verdict == verdict]
     if verdict == PASS:
         yield "Every item conforms with its limits."
         return
-    rows = [item_row(item) for item in deciding[:3]]
+    rows = map(item_row, deciding[:3])
     named = "; ".join(f"{row['name']} is {row['value']}, limits {row['limits']}" for row in rows)
-    more = len(deciding) - len(rows)
-    also = f"; and {counted(more, 'more item')}" if more else ""
+    also = f"; and {counted(len(deciding) - 3, 'more item')}" if len(deciding) > 3 else ""
     subject = "Fails" if verdict == FAIL else "Cannot be decided"
     yield f"{subject}: {named}{also}."
 
@@ -86,14 +90,6 @@ def _next(acceptance: Acceptance) -> str:
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
-
-
-def _results(items: Sequence[Item]) -> Table:
-    return Table(
-        ("quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"),
-        [tuple(row[column] for column in _COLUMNS[:5]) for row in map(item_row, items)],
-        marked=[index for index, item in enumerate(items) if item.verdict != PASS],
-    )
 
 
 def _uncertainty(items: Sequence[Item]) -> Section:
@@ -116,7 +112,6 @@ def _uncertainty(items: Sequence[Item]) -> Section:
 
 
 def _remarks(items: Sequence[Item]) -> Iterator[Statement]:
-    """Yield why items are undecided and what would decide them, each text with the items that it is about."""
     texts = {}
     for item in items:
         if text := item.said():
@@ -143,9 +138,8 @@ def item_row(item: Item) -> dict[str, str]:
         return dict.fromkeys(_COLUMNS, "") | {"value": "not determined"} | row
     expanded = 2 * factor * item.sigma
     digits = max(0, 1 - int(np.floor(np.log10(expanded)))) if expanded > 0 else 6
-    value = f"{factor * item.value:z.{digits}f} ± {expanded:.{digits}f} {shown}".replace("-", "−")
     return row | {
-        "value": value,
+        "value": f"{factor * item.value:z.{digits}f} ± {expanded:.{digits}f} {shown}".replace("-", "−"),
         "coverage": f"{100 * coverage(item.freedom):.1f} %",
         "freedom": f"{item.freedom:.0f}" if item.freedom < 1e4 else "∞",
         "probability": probability_words(item.probability),

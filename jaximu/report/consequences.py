@@ -53,7 +53,6 @@ def page_of(
 
 
 def _verdict(consequences: Consequences) -> tuple[str, ...]:
-    """Say how far position is off at the end, and why."""
     name = _order(consequences)[0]
     total = _metres(_at_end(consequences.total))
     return (
@@ -63,7 +62,6 @@ def _verdict(consequences: Consequences) -> tuple[str, ...]:
 
 
 def _next(consequences: Consequences) -> str:
-    """Say which command makes the error smaller, where a better calibration would."""
     if _at_end(consequences.calibration) < _at_end(consequences.noise):
         return ""
     file = consequences.calibration_file
@@ -83,7 +81,6 @@ def _tracks(consequences: Consequences) -> Iterator[Part]:
 
 
 def _tables(consequences: Consequences) -> Iterator[Section]:
-    """Return the position error by term, and all errors by direction, at the times that are shown."""
     times = [f"after {_seconds(consequences.times[row])}" for row in _places(consequences)]
     yield Section(
         "Position error by term (1σ)",
@@ -102,7 +99,6 @@ def _tables(consequences: Consequences) -> Iterator[Section]:
 
 
 def _for_estimators(noise: Mapping[str, EstimatorNoise], files: Mapping[str, bytes]) -> Iterator[Section]:
-    """Return the noise for estimators, by where it is from, and the files that carry it."""
     for origin, one in noise.items():
         page = one.summary()
         yield Section(f"Noise for estimators, {origin}", (*page.verdict, *page.first, Items(page.notes)))
@@ -142,12 +138,10 @@ def _places(consequences: Consequences) -> list[int]:
 
 
 def _order(consequences: Consequences) -> list[str]:
-    """Names of the terms, the largest at the end of the path first."""
     return sorted(consequences.terms, key=lambda name: -_at_end(consequences.terms[name]))
 
 
 def _budget_rows(consequences: Consequences) -> list[tuple[str, ...]]:
-    """Return the position error at the times that are shown: the total, then each term, the largest first."""
     rows = _places(consequences)
 
     def row(name: str, variances: FloatArray) -> tuple[str, ...]:
@@ -161,8 +155,8 @@ def _budget_rows(consequences: Consequences) -> list[tuple[str, ...]]:
 
 
 def _total_rows(consequences: Consequences) -> list[tuple[str, ...]]:
-    """Return the errors of position, velocity and attitude by direction at the times that are shown."""
-    rows, sigma = _places(consequences), np.sqrt(consequences.total)
+    rows = _places(consequences)
+    sigma = np.sqrt(consequences.total)
     shown = []
     for part, what in enumerate(("position", "velocity", "attitude")):
         for axis, direction in enumerate(("east", "north", "up")):
@@ -176,8 +170,8 @@ def _total_rows(consequences: Consequences) -> list[tuple[str, ...]]:
 
 
 def _statements(consequences: Consequences) -> list[Statement]:
-    """Return what the budget means, each with what it is about."""
-    last, end = _at_end(consequences.total), _end(consequences)
+    last = _at_end(consequences.total)
+    end = _end(consequences)
     parts = [
         f"{name} from {round(start, 1):g} to {round(stop, 1):g} s" for name, start, stop in consequences.dominant()
     ]
@@ -232,7 +226,8 @@ def _budget_figure(consequences: Consequences) -> Figure:
     variances = {name: position(term) ** 2 for name, term in consequences.terms.items()}
     whole = np.maximum(np.sum(list(variances.values()), axis=0), 1e-300)
     visible = [name for name in _order(consequences) if (variances[name] / whole).max() >= LEAST_SHARE]
-    drawn, end = visible[: len(PALETTE)], f"after {_end(consequences)}"
+    drawn = visible[: len(PALETTE)]
+    end = f"after {_end(consequences)}"
     figure, (above, below) = figures.stacked(2, 3.2, sharex=True)
     for name, color in zip(drawn, PALETTE, strict=False):
         above.plot(consequences.times, np.sqrt(variances[name]), color=color, linewidth=1.4)

@@ -1,7 +1,7 @@
 """The page of a diagnosis: what is wrong, how sure that is, what the extension gains, then the evidence."""
 
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 
 import numpy as np
@@ -21,7 +21,7 @@ from jaximu.ground.page import Page, Part, Picture, Section, Statement, Table
 from jaximu.ground.quantities import Z95, change, listed, number, probability, readable, sentence, size, with_interval
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes.titles import effect_title
-from jaximu.model.effects import CATALOGUE
+from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.learned import ZERO_CELSIUS
 from jaximu.noise.deviations import deviation
 from jaximu.recordings.finding import Finding
@@ -68,7 +68,6 @@ def page_of(diagnosis: Diagnosis) -> Page:
 
 
 def _first(diagnosis: Diagnosis, twin: Twin) -> Iterator[Part]:
-    """Return the picture of the errors, how sure the verdict is, its cost, mistakes, causes, gain and failed checks."""
     yield Picture(
         "diagnosis",
         partial(_lead, diagnosis, twin),
@@ -101,18 +100,21 @@ def _first(diagnosis: Diagnosis, twin: Twin) -> Iterator[Part]:
 
 
 def _rest(diagnosis: Diagnosis, twin: Twin) -> Iterator[Part]:
-    """Return how to separate causes, the passed checks, the errors against what they may depend on, and the limits."""
     if diagnosis.options:
         yield Section("What would separate the causes", [*_options(diagnosis)])
     right = [check for check in diagnosis.checks if not check.adjusted < _DOUBT]
     yield Section("What the fitted model gets right", [_checks_table(right), *_evidence(diagnosis, twin)])
     if diagnosis.verdict != "adequate":
         yield Section("What could still hide in this recording", [*_limits(diagnosis)])
-    yield Section("Not observable here", [_blind_table(diagnosis)])
+    reasons = diagnosis.not_observable
+    rows = [
+        (sentence(reason), "; ".join(effect_title(name) for name in reasons if reasons[name] == reason))
+        for reason in dict.fromkeys(reasons.values())
+    ]
+    yield Section("Not observable here", [Table(("reason", "effects that it hides"), rows)])
 
 
 def _what_is_wrong(diagnosis: Diagnosis) -> Iterator[str]:
-    """Say whether the model fits, and if not, what it lacks."""
     standing = _standing(diagnosis)
     if diagnosis.verdict == "adequate":
         yield _adequate(diagnosis)
@@ -143,7 +145,6 @@ def _standing(diagnosis: Diagnosis) -> list[Finding]:
 
 
 def _adequate(diagnosis: Diagnosis) -> str:
-    """Say that nothing is missing, and whether all of the noise is as assumed and everything could be checked."""
     sure = f"(p {probability(diagnosis.p_value)})"
     worst = min(diagnosis.checks, key=lambda check: check.adjusted, default=None)
     if worst is not None and worst.adjusted < _DOUBT:
@@ -162,7 +163,6 @@ def _adequate(diagnosis: Diagnosis) -> str:
 
 
 def _causes(diagnosis: Diagnosis) -> str:
-    """Return the causes, each with what it adds and what it cannot be distinguished from."""
     texts = []
     for effect in diagnosis.effects:
         rivals = " or ".join(map(effect_title, effect.rivals))
@@ -172,7 +172,8 @@ def _causes(diagnosis: Diagnosis) -> str:
 
 def gained(diagnosis: Diagnosis) -> str:
     """Say what modelling the causes, or else the smooth curve, gains on data that was not fitted."""
-    gain, learned = diagnosis.gain, diagnosis.learned
+    gain = diagnosis.gain
+    learned = diagnosis.learned
     effects = [cause.effect for cause in diagnosis.named]
     if gain is not None:
         subject = "them" if len(effects) > 1 else "it"
@@ -195,12 +196,9 @@ def gained(diagnosis: Diagnosis) -> str:
 
 def _number(diagnosis: Diagnosis) -> tuple[str, str]:
     """Return an error on data not fitted, without and with the extension, or else that of the fit; and what it is."""
-    gain, learned = diagnosis.gain, diagnosis.learned
-    if learned is not None:
-        gain = learned.gain
+    gain, effects, subject = _extension(diagnosis)
     if gain is not None:
-        effects = [learned.effect] if learned is not None else [cause.effect for cause in diagnosis.named]
-        kind, subject = gain.best_kind(*effects), "extension" if learned is None else "curve"
+        kind = gain.best_kind(*effects)
         if gain.smaller(effects) or gain.log_likelihood <= 0:
             meaning = f"rms of {_kind_words(diagnosis)[kind]} on data not fitted ({gain.data}), without and with the "
             return gain.errors(kind), meaning + subject
@@ -221,7 +219,6 @@ def _number(diagnosis: Diagnosis) -> tuple[str, str]:
 
 
 def _next(diagnosis: Diagnosis) -> str:
-    """Return what to record or run next."""
     files = [*map(shlex.quote, diagnosis.calibration.files)] or ["LOG"]
     repairs = dict.fromkeys(finding.repair for finding in _standing(diagnosis) if finding.repair)
     by_hand = diagnosis.experiment.data.by_hand  # else the command has more arguments
@@ -249,7 +246,6 @@ def _mistake(diagnosis: Diagnosis, finding: Finding) -> Statement:
 
 
 def _effect_row(effect: Named | NoiseFinding) -> tuple[str, str, str, str]:
-    """Return a cause's cells: what it is, what it adds to the output, its coefficients and its evidence."""
     evidence = effect.evidence + " (weak)" * effect.weak
     numbers = "\n".join(effect.numbers())
     if isinstance(effect, NoiseFinding):
@@ -262,10 +258,13 @@ def _effect_row(effect: Named | NoiseFinding) -> tuple[str, str, str, str]:
 def _lines_figure(diagnosis: Diagnosis) -> Figure:
     """Draw the spectrum over time of the axes with lines that move, those that cross zero frequency first."""
     parts = diagnosis.calibration.segmentations
-    axes_of = list(dict.fromkeys((one.recording, one.triad, one.line.axis) for one in diagnosis.lines))[:_PANELS]
+    lines = {}
+    for one in diagnosis.lines:
+        lines.setdefault((one.recording, one.triad, one.line.axis), []).append(one)
+    axes_of = list(lines)[:_PANELS]
     figure, grid = figures.stacked(len(axes_of), 2.4, 0.6)
     for axes, key in zip(grid, axes_of, strict=True):
-        mine = [one for one in diagnosis.lines if (one.recording, one.triad, one.line.axis) == key]
+        mine = lines[key]
         times, power = spectrum_at_rest(parts[key[0]], *key[1:])
         axes.pcolormesh(
             times,
@@ -290,7 +289,6 @@ def _lines_figure(diagnosis: Diagnosis) -> Figure:
 
 
 def _learned_part(diagnosis: Diagnosis) -> Iterator[Section]:
-    """Return the smooth curve that the misfit follows."""
     learned = diagnosis.learned
     if learned is None:
         return
@@ -316,7 +314,6 @@ def _learned_part(diagnosis: Diagnosis) -> Iterator[Section]:
 
 
 def _gains(diagnosis: Diagnosis) -> Iterator[Table]:
-    """Yield the errors on data that was not fitted, with what was added to the model."""
     if diagnosis.gain is not None:
         yield _gain_table(diagnosis, "extended model", diagnosis.gain)
     if diagnosis.learned is not None and not diagnosis.learned.drift:
@@ -324,8 +321,8 @@ def _gains(diagnosis: Diagnosis) -> Iterator[Table]:
 
 
 def _gain_table(diagnosis: Diagnosis, what: str, gain: Gain) -> Table:
-    """Return the errors of a model without and with an extension."""
-    words, caption = _kind_words(diagnosis), ""
+    words = _kind_words(diagnosis)
+    caption = ""
     for way in (gain, gain.otherwise):
         if way is not None:
             before, after = (part.chi_squared / part.count for part in (way.before, way.after))
@@ -339,7 +336,6 @@ def _gain_table(diagnosis: Diagnosis, what: str, gain: Gain) -> Table:
 
 
 def _certainty(diagnosis: Diagnosis) -> Iterator[Statement]:
-    """Say how probable such data are if the model is complete, what the tests allow for, and which cause is weak."""
     verdict = "This is not chance"
     if diagnosis.p_value > _DOUBT:
         verdict = "This is consistent with noise" if diagnosis.verdict == "adequate" else "This may be chance"
@@ -357,7 +353,6 @@ def _certainty(diagnosis: Diagnosis) -> Iterator[Statement]:
 
 
 def _cost(diagnosis: Diagnosis) -> Iterator[Statement]:
-    """Say by how much the output is wrong where the calibration lacks the causes."""
     outputs = [
         f"{effect.effect.title} changes the {effect.triad}'s output by up to {effect.size()}"
         for effect in diagnosis.named
@@ -377,7 +372,6 @@ def _cost(diagnosis: Diagnosis) -> Iterator[Statement]:
 
 
 def _limits(diagnosis: Diagnosis) -> Iterator[Part]:
-    """Return the detection limits and what an effect of that size would do, the worst first."""
     yield (
         "An effect could be there unnoticed up to its detection limit: the size (coefficients in a random direction) "
         "that its test finds with 90 % power. It would shift the calibrated numbers by as much as the last column "
@@ -399,7 +393,6 @@ def _limits(diagnosis: Diagnosis) -> Iterator[Part]:
 
 
 def _shift_words(diagnosis: Diagnosis, cause: Hidden) -> str:
-    """Return which number a cause would shift most, and by how much."""
     name, sigmas = cause.worst
     if not name:
         return "nothing"
@@ -408,14 +401,13 @@ def _shift_words(diagnosis: Diagnosis, cause: Hidden) -> str:
 
 
 def _in_plausible_sizes(diagnosis: Diagnosis, name: str, limit: float) -> float:
-    """Return an effect's detection limit in multiples of a plausible size."""
-    kind, imu = CATALOGUE[name], diagnosis.base.imu
+    kind = CATALOGUE[name]
+    imu = diagnosis.base.imu
     triad = imu.triads().get(kind.owner, imu.accelerometer)
     return limit / (kind.typical * (float(np.mean(triad.scales)) if kind.unit.startswith("output") else 1.0))
 
 
 def _options(diagnosis: Diagnosis) -> Iterator[Part]:
-    """Return the powers of recordings that could be made to distinguish the causes, and of this one."""
     yield (
         "Each recording is simulated with this unit and its noise; the power is that of distinguishing the causes (at "
         "the 1 % level), or of finding the only one."
@@ -429,7 +421,6 @@ def _options(diagnosis: Diagnosis) -> Iterator[Part]:
 
 
 def _checks_table(checks: list[Check]) -> Table:
-    """Return checks of the base model, the most significant first."""
     return Table(
         ("check of the base model", "statistic", "p-value"),
         [
@@ -443,7 +434,6 @@ def _checks_table(checks: list[Check]) -> Table:
 
 
 def _evidence(diagnosis: Diagnosis, twin: Twin) -> Iterator[Picture]:
-    """Return errors against what they may depend on, and the noise at rest."""
     yield Picture(
         "dependence",
         partial(_dependence, diagnosis, twin),
@@ -462,37 +452,27 @@ def _evidence(diagnosis: Diagnosis, twin: Twin) -> Iterator[Picture]:
         )
 
 
-def _blind_table(diagnosis: Diagnosis) -> Table:
-    """Return each reason once, with the effects that it hides."""
-    reasons = diagnosis.not_observable
-    return Table(
-        ("reason", "effects that it hides"),
-        [
-            (sentence(reason), "; ".join(effect_title(name) for name in reasons if reasons[name] == reason))
-            for reason in dict.fromkeys(reasons.values())
-        ],
-    )
-
-
 def _kind_words(diagnosis: Diagnosis) -> dict[str, str]:
-    """Return what each kind of error is called."""
     return {kind.name: kind.words for kind in diagnosis.experiment.real.kinds}
 
 
-def _shown_kind(diagnosis: Diagnosis) -> int:
-    """Return the index of the kind of error that the first picture shows."""
-    kinds = [kind.name for kind in diagnosis.experiment.real.kinds]
+def _extension(diagnosis: Diagnosis) -> tuple[Gain | None, Sequence[Effect], str]:
+    """Return what a smooth curve gains on data not fitted, or else the named effects; these; and what it is called."""
     if diagnosis.learned is not None:
-        return kinds.index(diagnosis.learned.gain.best_kind(diagnosis.learned.effect))
-    if diagnosis.named and diagnosis.gain is not None:
-        return kinds.index(diagnosis.gain.best_kind(*(cause.effect for cause in diagnosis.named)))
+        return diagnosis.learned.gain, [diagnosis.learned.effect], "curve"
+    return diagnosis.gain, [cause.effect for cause in diagnosis.named], "extension"
+
+
+def _shown_kind(diagnosis: Diagnosis) -> int:
+    gain, effects, _ = _extension(diagnosis)
+    if effects and gain is not None:
+        return list(_kind_words(diagnosis)).index(gain.best_kind(*effects))
     present = np.unique(diagnosis.experiment.real.kind)
     first = diagnosis.checks[: len(present)]
     return int(present[first.index(min(first, key=lambda check: check.p_value))])
 
 
 def _lead(diagnosis: Diagnosis, twin: Twin) -> Figure:
-    """Draw the errors of the recording, its twin and the extended model, and the test of each effect."""
     simulated, refit = twin()
     figure = figures.new_figure(4.3)
     left, right = figure.subplots(1, 2, width_ratios=[1.35, 1])
@@ -514,7 +494,6 @@ def _lead(diagnosis: Diagnosis, twin: Twin) -> Figure:
 
 
 def _ranking(panel: Axes, diagnosis: Diagnosis) -> None:
-    """Draw the evidence of each effect, the strongest on top."""
     evidence = diagnosis.base.evidence
     scores = evidence.scores()
     best = {}
@@ -537,13 +516,13 @@ def _ranking(panel: Axes, diagnosis: Diagnosis) -> None:
 
 
 def _dependence(diagnosis: Diagnosis, twin: Twin) -> Figure:
-    """Draw each kind of error against what it may depend on."""
     real, (simulation, refit) = diagnosis.experiment.real, twin()
     rows = [int(kind) for kind in np.unique(real.kind)]
     covariates, shadow = ({row: source.dependences(row) for row in rows} for source in (real, simulation.real))
     figure = figures.new_figure(2.1 * len(rows) + 0.4)
     panels = figure.subplots(len(rows), max(len(table) for table in covariates.values()), squeeze=False, sharey="row")
-    measured, simulated = diagnosis.experiment.errors(diagnosis.base), simulation.errors(refit)
+    measured = diagnosis.experiment.errors(diagnosis.base)
+    simulated = simulation.errors(refit)
     for line, row in zip(panels, rows, strict=True):
         kind = real.kinds[row]
         factor, unit = readable(kind.unit, _AN_ERROR)
@@ -561,12 +540,13 @@ def _dependence(diagnosis: Diagnosis, twin: Twin) -> Figure:
 
 
 def _learned(learned: LearnedTerm) -> Figure:
-    """Draw the smooth curve of each axis with its band."""
     unit, factor, shift = learned.effect.covariate_unit, 1.0, 0.0
     if learned.effect.words == "temperature":
-        unit, shift = "°C", ZERO_CELSIUS
+        unit = "°C"
+        shift = ZERO_CELSIUS
     elif unit == "rad/s":
-        unit, factor = "°/s", np.degrees(1.0)
+        unit = "°/s"
+        factor = np.degrees(1.0)
     scale, label = readable(SENSOR_UNITS[learned.triad], _AN_ERROR)
     figure = figures.new_figure(2.8)
     panels = figure.subplots(1, 3, sharey=True)
@@ -586,11 +566,10 @@ def _learned(learned: LearnedTerm) -> Figure:
 
 
 def _noise(diagnosis: Diagnosis, twin: Twin) -> Figure:
-    """Draw spectrum and Allan deviation at rest, measured and simulated."""
     figure = figures.new_figure(5.8)
     panels = figure.subplots(2, 2)
-    for column, (name, unit) in enumerate((("accelerometer", "m/s²"), ("gyroscope", "rad/s"))):
-        spectrum, allan = panels[:, column]
+    triads = (("accelerometer", "m/s²"), ("gyroscope", "rad/s"))
+    for (spectrum, allan), (name, unit) in zip(panels.T, triads, strict=True):
         for label, colour, experiment in (("measured", _MEASURED, diagnosis.experiment), ("twin", _TWIN, twin()[0])):
             frequency, density = _density(experiment, name)
             spectrum.plot(frequency, np.sqrt(density), color=colour, linewidth=1, label=label)

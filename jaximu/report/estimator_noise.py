@@ -8,7 +8,7 @@ import numpy as np
 
 from jaximu.ground.page import Page, Statement, Table
 from jaximu.ground.quantities import number, sentence
-from jaximu.navigation.estimator_noise import EstimatorNoise, TriadNoise
+from jaximu.navigation.estimator_noise import EstimatorNoise
 
 _LEAST = 0.05
 """Terms that stay below this multiple of N are not shown."""
@@ -41,11 +41,11 @@ def statements(noise: EstimatorNoise) -> Iterator[Statement]:
     at = _length(noise)
     for name, triad in noise.triads.items():
         if triad.high[noise.chosen] < _QUIETER:
-            text = (
+            yield Statement(
+                sentence(name),
                 f"The errors in motion are {number(triad.multiplier[noise.chosen])} times the white noise over {at}. "
-                "The noise is left as it is, because in motion a sensor is no quieter than at rest."
+                "The noise is left as it is, because in motion a sensor is no quieter than at rest.",
             )
-            yield Statement(sentence(name), text)
     for name, values in noise.nees.items():
         off = [
             f"{number(value, 2)} at {length:g} s"
@@ -53,36 +53,30 @@ def statements(noise: EstimatorNoise) -> Iterator[Statement]:
             if not _HOLDS[0] <= value <= _HOLDS[1]
         ]
         if off:
-            text = (
+            yield Statement(
+                f"NEES of {name}",
                 f"No white noise makes the NEES of {name} one at every length: with the numbers for {at} it is "
-                f"{', '.join(off)}. Above one the estimator trusts the unit too much, below one too little."
+                f"{', '.join(off)}. Above one the estimator trusts the unit too much, below one too little.",
             )
-            yield Statement(f"NEES of {name}", text)
 
 
 def _table(noise: EstimatorNoise) -> Table:
-    """Return the multipliers, what they are made of, and the NEES with them, by length."""
     rows = []
     for name, triad in noise.triads.items():
-        rows.append((f"{name}, N times (95 %)", *_multipliers(triad)))
+        intervals = zip(triad.multiplier, triad.low, triad.high, strict=True)
+        texts = (f"{number(middle)} ({number(low)} to {number(high)})" for middle, low, high in intervals)
+        rows.append((f"{name}, N times (95 %)", *texts))
         rows += [
             (f"– {term}", *(f"{value:.2f}" for value in values))
             for term, values in triad.terms.items()
             if np.max(values) >= _LEAST
         ]
     for name, values in noise.nees.items():
-        rows.append((f"NEES of {name}, as stated", *(number(value, 2) for value in values[:, 0])))
-        rows.append((f"NEES of {name}, multiplied", *(number(value, 2) for value in values[:, 1])))
+        for with_noise, row in zip(("as stated", "multiplied"), values.T, strict=True):
+            rows.append((f"NEES of {name}, {with_noise}", *(number(value, 2) for value in row)))
     return Table(
         ("", *(f"over {length:g} s" for length in noise.lengths)),
         rows,
         "Terms after a dash: what each would make by itself, as a multiple of N. NEES: squared error over what the "
         "estimator expects; it should be one.",
     )
-
-
-def _multipliers(triad: TriadNoise) -> list[str]:
-    return [
-        f"{number(middle)} ({number(low)} to {number(high)})"
-        for middle, low, high in zip(triad.multiplier, triad.low, triad.high, strict=True)
-    ]

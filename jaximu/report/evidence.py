@@ -63,13 +63,15 @@ def evidence(calibration: Calibration) -> PoseAndTurnErrors | None:
         tilt = (matrices.trace(axis1=1, axis2=2) - along(matrices)) / 2 / gravity**2
         return tilt[1:] + tilt[:-1]
 
-    noise, total = tilts(covariance), tilts(extended)
+    noise = tilts(covariance)
+    total = tilts(extended)
     if used.any():
         # rotating the rate's white noise along the turn keeps its mean over the three axes
         inverse = np.linalg.inv(np.asarray(fit.imu.triads()["gyroscope"].gain))
         density = (inverse @ np.asarray(observations.turns.noise) @ inverse.T).trace() / 3
         turned = density * np.asarray(observations.turns.interval).sum(axis=1)
-        noise, total = noise + turned, total + turned + of_turns * turned[used].mean()
+        noise = noise + turned
+        total = total + turned + of_turns * turned[used].mean()
 
     def limit(variance: FloatArray) -> FloatArray:
         # two components of equal variance: 95 % of the angles lie below sqrt(5.99) of one's sigma

@@ -148,7 +148,6 @@ def envelope(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def _traces(axes: Axes, signal: Signal, offset: float = 0.0, named: bool = True) -> None:
-    """Draw a signal's columns against time, in SI."""
     time, values = envelope(signal.time, signal.si())
     for column, (axis, color) in zip(values.T, AXES.items(), strict=False):
         axes.plot(time + offset, column, color=color, linewidth=0.7, label=axis if named else None)
@@ -181,7 +180,8 @@ def recording_of(calibration: Calibration) -> Figure:
     figure, grid = stacked(rows, 2.0, 2.0, sharex=True)
     shift, still, spans = 0.0, 0.0, []
     for part in parts:
-        time, intervals = part.recording.accelerometer.time, part.intervals
+        time = part.recording.accelerometer.time
+        intervals = part.intervals
         offset = shift - time[0] if len(parts) > 1 else 0.0
         for axes, name in zip(grid, ("accelerometer", "gyroscope"), strict=False):
             _traces(axes, getattr(part.recording, name), offset, not shift)
@@ -221,7 +221,6 @@ def recording_of(calibration: Calibration) -> Figure:
 
 
 def _number_poses(axes: Axes, spans: Sequence[tuple[float, float]]) -> None:
-    """Write the numbers of poses above them, as many as there is room for."""
     every = next(step for step in (1, 2, 5, 10, 20, 50, 100, 1000, 10**9) if len(spans) <= 25 * step)
     style = {"fontsize": 7, "ha": "center", "va": "bottom", "color": "#444444"}
     for pose, (start, length) in enumerate(spans, start=1):
@@ -301,7 +300,8 @@ def correlation_figure(calibration: Calibration) -> Figure:
     names = [short_name(name, calibration.imu) for name in parameters]
     sigma = sigmas_of(calibration.covariance)
     sigma = np.where(sigma > 0, sigma, 1.0)
-    matrix, count = calibration.covariance / sigma[:, None] / sigma, len(names)
+    matrix = calibration.covariance / sigma[:, None] / sigma
+    count = len(names)
     height = max(4.6, 0.36 * count + 1.0)
     figure = new_figure(height, min(_WIDTH, height + 1.2))
     axes, scale = figure.subplots(1, 2, width_ratios=(1, 0.04))
@@ -363,7 +363,8 @@ def hemispheres(
     the figure's grid, in whose `columns` the panels are the first two, with room for a colour bar below.
     """
     grid = figure.add_gridspec(2, columns, height_ratios=(1, 0.03))
-    circle, panels = np.linspace(0, 2 * np.pi, 200), []
+    circle = np.linspace(0, 2 * np.pi, 200)
+    panels = []
     for column, sign in enumerate((1, -1)):
         axes = figure.add_subplot(grid[0, column])
         here = directions[:, 2] >= 0 if sign > 0 else directions[:, 2] < 0

@@ -60,7 +60,8 @@ def statements(calibration: Calibration, history: History) -> Iterator[Statement
 
 def _convergence(history: History) -> str:
     """Say after how long each kind of number was known to twice its last uncertainty."""
-    parts, never = [], []
+    parts = []
+    never = []
     for owner, part, *_ in _PANELS:
         times = [history.converged(state) for state in _places(history, owner, part)]
         if times and None not in times:
@@ -74,7 +75,6 @@ def _convergence(history: History) -> str:
 
 
 def _places(history: History, owner: str, part: str) -> list[int]:
-    """Return the places of a triad's gains or biases among the states."""
     return [
         state for state, name in enumerate(history.names) if (name.owner, name.part, name.effect) == (owner, part, None)
     ]
@@ -90,18 +90,19 @@ def _earth(history: History) -> Statement | None:
     spread = np.linalg.norm(value * sigma) / max(total, 1e-30)
     near = abs(total - EARTH_RATE) < 4 * spread + 0.02 * EARTH_RATE
     if total < 4 * spread or (near and spread > 0.1 * EARTH_RATE):
-        text = (
+        return Statement(
+            "Earth's rotation",
             f"Not determined here: {total * _HOUR:.2g} ± {Z95 * spread * _HOUR:.2g} °/h beside the true 15.04 °/h. The "
-            "intervals of the gyroscope's bias include it."
+            "intervals of the gyroscope's bias include it.",
         )
-        return Statement("Earth's rotation", text)
     rate = f"{number(total * _HOUR)} ± {number(Z95 * spread * _HOUR, 2)} °/h"
     if not near:
-        text = (
+        return Statement(
+            "Earth's rotation",
             f"What turns with the level frame is {rate}, and the Earth's rotation is 15.04 °/h: a rate that depends on "
-            "orientation, such as gyroscope g-sensitivity, is in it. Run `jaximu diagnose`."
+            "orientation, such as gyroscope g-sensitivity, is in it. Run `jaximu diagnose`.",
+            True,
         )
-        return Statement("Earth's rotation", text, True)
     latitude = np.degrees(np.arcsin((value[2] / total).clip(-1, 1)))
     return Statement(
         "Earth's rotation", f"Found as {rate} (15.04 °/h), which puts the unit at latitude {latitude:.2f}°."
@@ -148,11 +149,13 @@ _Line = tuple[FloatArray, FloatArray, str, str]
 def _triads(calibration: Calibration, history: History) -> Iterator[tuple[str, list[_Line]]]:
     """Yield the title of each panel of biases and scales, and its lines, less their last values."""
     for owner, part, title, factor in _PANELS:
-        gain, lines = getattr(calibration.imu, owner).scales, []
+        gain = getattr(calibration.imu, owner).scales
+        lines = []
         for state in _places(history, owner, part):
             axes = history.names[state].axes
             if len(set(axes)) == 1:
-                unit, axis = factor / gain[axes[0]], "xyz"[axes[0]]
+                unit = factor / gain[axes[0]]
+                axis = "xyz"[axes[0]]
                 value = history.values[:, state] - history.values[-1, state]
                 lines.append((unit * value, abs(unit) * history.sigmas[:, state], AXES[axis], axis))
         yield title, lines

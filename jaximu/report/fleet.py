@@ -32,10 +32,19 @@ _KINDS = (
 
 def page_of(fleet: Fleet, magnetometers: Sequence[str] = ()) -> Page:
     """Return the population, outliers, what lots and dates change, what failed; `magnetometers`: sentences on these."""
-    done, document = fleet.statuses["ok"], Path(fleet.table).with_suffix(".json").name
+    done = fleet.statuses["ok"]
+    document = Path(fleet.table).with_suffix(".json").name
 
     def rest() -> Iterator[Part]:
-        yield from _lots(fleet)
+        lots = [difference for difference in fleet.differences if difference.kind == "lot"]
+        if lots and fleet.population is not None:
+            picture = Picture(
+                "lots",
+                partial(lot_figure, fleet, lots[0]),
+                "A parameter by lot",
+                "The parameter that differs most, unit by unit in each lot; lots that differ are orange.",
+            )
+            yield Section("Lots", [picture])
         yield from _prior(fleet)
         yield _diagnoses(fleet)
 
@@ -77,7 +86,6 @@ def _verdict(fleet: Fleet) -> Iterator[str]:
 
 
 def _first(names: Sequence[str], most: int) -> str:
-    """Return the first of some names, and how many more there are."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
@@ -125,7 +133,6 @@ def _outliers(fleet: Fleet, document: str) -> Section:
 
 
 def _differences(fleet: Fleet) -> Iterator[Part]:
-    """Yield what differs by lot, date or recording, the surest first; else what was compared."""
     names = {"lot": "lot", "date": "drift", "device": "recorded again", "effect": "effect shared by a lot"}
     rows = [
         (names[difference.kind], difference_words(difference), probability(difference.p_value).removeprefix("= "))
@@ -165,7 +172,6 @@ def difference_words(difference: Difference) -> str:
 
 
 def _failures(fleet: Fleet, document: str) -> Section:
-    """Return the commonest reasons why recordings were not calibrated, with files; what is left out is counted."""
     most = 20
     rows = [
         (sentence(reason), str(len(files)), _first([Path(file).name for file in files], 5))
@@ -218,24 +224,7 @@ def _population(fleet: Fleet) -> Iterator[Picture]:
         )
 
 
-def _lots(fleet: Fleet) -> Iterator[Section]:
-    lots = [difference for difference in fleet.differences if difference.kind == "lot"]
-    if lots and fleet.population is not None:
-        yield Section(
-            "Lots",
-            [
-                Picture(
-                    "lots",
-                    partial(lot_figure, fleet, lots[0]),
-                    "A parameter by lot",
-                    "The parameter that differs most, unit by unit in each lot; lots that differ are orange.",
-                )
-            ],
-        )
-
-
 def _prior(fleet: Fleet) -> Iterator[Section]:
-    """Yield the parameters, and how much better a unit is known with the fleet as prior."""
     if fleet.population is None:
         return
     alone, prior = (np.quantile(sigma, 0.9, axis=0) for sigma in (fleet.sigma, fleet.shrunk_sigma))
@@ -360,7 +349,8 @@ def lot_figure(fleet: Fleet, difference: Difference) -> Figure:
     population = fleet.population
     assert population is not None
     name = difference.parameters[0][0]
-    kind, k = _kind_of(name), population.names.index(name)
+    kind = _kind_of(name)
+    k = population.names.index(name)
     values = kind[-1] * (fleet.values[:, k] - population.mean[k])
     lots = np.array(fleet.lots)
     names = sorted({*fleet.lots} - {""})

@@ -63,7 +63,8 @@ class LivePage:
 
     def parts(self) -> dict[str, str]:
         """Return what stands in each element of the page, as HTML."""
-        capture, moment = self.capture, self.capture.moment
+        capture = self.capture
+        moment = self.capture.moment
         lasting = time.monotonic() - capture.since > _LASTING
         texts = {
             "headline": _headline(capture),
@@ -75,7 +76,8 @@ class LivePage:
 
     def _parts_of(self, moment: Moment, over: bool) -> dict[str, str]:
         rest = self.capture.rest
-        ups, still = moment.ups, min(moment.still, rest)
+        ups = moment.ups
+        still = min(moment.still, rest)
         first = attitude_of(ups[0] if len(ups) else moment.held).as_quat(scalar_first=True)
         before = reduce(turned_to, ups[1:], first)  # from pose to pose by the shortest turn: its heading is not known
         parts = {
@@ -97,7 +99,6 @@ class LivePage:
         }
 
     def _progress(self, moment: Moment) -> str:
-        """Return how many poses count, of how many or beside how far the goals are."""
         count = len(moment.taken)
         if not moment.goals:
             return str(self._macros.bar(count, moment.wanted, f"{count} of {moment.wanted} poses count"))
@@ -109,8 +110,8 @@ class LivePage:
         return self._kept(name, (attitude / _STEP).round().tobytes(), lambda: picture)
 
     def _map(self, moment: Moment, over: bool) -> str:
-        """Return the map of what is uncertain, with the poses and, in another colour, the next one."""
-        ups, names = moment.ups, [f"pose {index}" for index in range(1, len(moment.ups) + 1)]
+        ups = moment.ups
+        names = [f"pose {index}" for index in range(1, len(moment.ups) + 1)]
         colors = [_POSE] * len(names)
         if moment.up is not None and not over:
             ups, names, colors = np.vstack([ups, moment.up]), [*names, f"next: {moment.words}"], [*colors, _NEXT]
@@ -149,7 +150,6 @@ class LivePage:
 
 
 def _headline(capture: Capture) -> str:
-    """Say what to do now."""
     moment = capture.moment
     if capture.end or moment is None:
         return capture.end or "Waiting for the first samples"

@@ -54,13 +54,12 @@ def _duration(history: UnitHistory, time: float) -> str:
 
 
 def _time(time: float, per: str) -> str:
-    """Return a time with its unit, in two digits."""
     return f"{number(time, 2)} {per}s"
 
 
 def _verdict(history: UnitHistory) -> Iterator[str]:
-    """Yield what moved, and when the unit is due again."""
-    test, moved = history.together["all"], history.moved
+    test = history.together["all"]
+    moved = history.moved
     ratio = (
         f"χ² {number(test.statistic)} of {counted(test.freedom, 'degree')} of freedom, p {probability(test.p_value)}"
     )
@@ -86,7 +85,6 @@ def _words(movement: Movement) -> str:
 
 
 def _due(history: UnitHistory) -> str:
-    """Say when the first limit's guard band is reached."""
     if history.interval is None:
         return "At the drift seen, no limit is ever reached."
     first = next(limit for limit in history.limits if limit.after == history.interval)
@@ -99,7 +97,6 @@ def _due(history: UnitHistory) -> str:
 
 
 def _number(history: UnitHistory) -> tuple[str, str]:
-    """Return the time until a limit is reached where limits are held, else the output's error, else the p-value."""
     if history.interval is not None:
         return _time(history.interval, history.per), "until the first limit's guard band is reached"
     for owner, change in history.output.items():
@@ -113,8 +110,7 @@ def _number(history: UnitHistory) -> tuple[str, str]:
 
 def _next(history: UnitHistory) -> str:
     if not history.limits:
-        names = shlex.join(history.files)
-        return f"`jaximu compare {names} --limits LIMITS.toml` works out when limits are reached."
+        return f"`jaximu compare {shlex.join(history.files)} --limits LIMITS.toml` works out when limits are reached."
     return (
         f"`jaximu accept {shlex.quote(history.files[-1])} --limits {shlex.quote(history.limits_file)}` holds the last "
         "calibration to the limits."
@@ -173,7 +169,6 @@ def _rest(history: UnitHistory) -> Iterator[Part]:
 
 
 def _numbers_table(history: UnitHistory) -> Table:
-    """Return each number's first value, its change, and its drift, the surest first."""
     straight = len(history.files) > 2
     over_time = straight or history.per == "year"  # a difference over one step is its own drift
     headers = ["number", "first ± 95 %", "last − first ± 95 %", "σ", "p, all allowed for"]
@@ -224,17 +219,16 @@ def _together_table(history: UnitHistory) -> Table:
 
 
 def _limits_table(history: UnitHistory) -> Table:
-    """Return each limit, where its number is and drifts, and when its guard band is reached, the first first."""
     movements = {movement.name: movement for movement in history.movements}
 
     def row(reached: LimitReached) -> tuple[str, ...]:
-        movement, limit = movements[reached.name], reached.limit
+        movement = movements[reached.name]
+        limit = reached.limit
         after = "never, at this drift" if reached.after is None else _duration(history, reached.after)
-        level = _amount(movement, movement.line.level, float(np.sqrt(movement.line.covariance[0, 0])))
         return (
             spoken(reached.name),
             between(limit.low, limit.high, limit.unit, limit.stated),
-            level,
+            _amount(movement, movement.line.level, float(np.sqrt(movement.line.covariance[0, 0]))),
             f"{_drift(movement)}/{history.per}",
             after,
         )
@@ -305,7 +299,8 @@ def _history_figure(history: UnitHistory) -> Figure:
     at = np.array(history.dates, "datetime64[D]") if dated else history.times
     for panel, movement in zip(panels, movements, strict=True):
         factor, _ = _points(panel, movement, at)
-        line, ahead = movement.line, np.linspace(history.times[0], 0.0, 100)
+        line = movement.line
+        ahead = np.linspace(history.times[0], 0.0, 100)
         shared = movement.sigmas[-1] ** 2 - movement.apart[-1] ** 2
         variance = line.covariance[0, 0] - shared + (2 * line.covariance[0, 1] + line.covariance[1, 1] * ahead) * ahead
         half = float(student_isf(0.025, line.freedom)) * np.sqrt(np.maximum(variance, 0.0))

@@ -45,7 +45,8 @@ def encoded(page: Page) -> tuple[bytes, dict[str, bytes]]:
 
     The page has no folders of the machine that made it. In place of a figure that cannot be drawn the page says so.
     """
-    first, rest = [*page.first], [*page.rest()]
+    first = [*page.first]
+    rest = [*page.rest()]
     pictures = {}
     drawings = {}
     for picture in _pictures([*first, *rest]):

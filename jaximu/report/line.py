@@ -38,7 +38,8 @@ _WithCpk = Sequence[tuple[FollowedQuantity, float]]
 
 def page_of(line: Line) -> Page:
     """Return the worst quantity's Cpk, charts with the limits, capability, alarms; what does not pass and the gauge."""
-    able, charts = _by_capability(line), _to_draw(line)
+    able = _by_capability(line)
+    charts = _to_draw(line)
     pictures = [
         Picture(
             "charts",
@@ -69,13 +70,11 @@ def page_of(line: Line) -> Page:
 
 
 def _by_capability(line: Line) -> _WithCpk:
-    """Return the quantities that have limits with their Cpk, the worst first."""
     able = [(quantity, quantity.capability.cpk[0]) for quantity in line.followed if quantity.capability is not None]
     return sorted(able, key=lambda pair: pair[1])
 
 
 def _number(line: Line, able: _WithCpk) -> tuple[str, str]:
-    """Return the worst Cpk with its interval, else how many recordings pass, and what it is."""
     if able and (capability := able[0][0].capability) is not None:
         return _index(
             capability.cpk
@@ -106,7 +105,6 @@ def _verdict(line: Line, able: _WithCpk) -> Iterator[str]:
 
 
 def _why_not_capable(quantity: FollowedQuantity) -> str:
-    """Say whether a quantity's scatter or its mean brings units beyond its limits."""
     capability, limit, unit = quantity.capability, quantity.limit, si_unit(quantity.name)
     assert capability is not None and limit is not None
     limits = between(limit.low, limit.high, unit, limit.stated)
@@ -180,7 +178,6 @@ def _index(ends: tuple[float, float, float]) -> str:
 
 
 def _alarm_rows(line: Line) -> list[tuple[str, str]]:
-    """Return title and sentence of each alarm, those of the whole line first."""
     stated = {quantity.name: quantity.limit.stated for quantity in line.followed if quantity.limit is not None}
     ordered = sorted(line.alarms, key=lambda alarm: _ORDER.index(alarm.kind))
     return [(_TITLES[alarm.kind], f"{sentence(alarm.words(stated.get(alarm.name, '')))}.") for alarm in ordered]
@@ -190,14 +187,13 @@ def _not_passed(line: Line) -> Section:
     cells = ("name", "value", "limits", "probability", "verdict")
     rows = [(device, *(item_row(item)[cell] for cell in cells)) for device, item in line.items(MOST_ROWS)]
     more = sum(len(line.missed(row)) for row in range(len(line.table.rows))) - len(rows)
-    caption = f"And {more} more; the table's column `not_passed` has all." if more else ""
     return Section(
         "What does not pass",
         [
             Table(
                 ("device", "quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"),
                 rows,
-                caption,
+                f"And {more} more; the table's column `not_passed` has all." if more else "",
             )
         ],
     )
@@ -213,15 +209,16 @@ def _gauge(line: Line) -> Section:
         value, low, high = (number(factor * end, 2) for end in gauge.repeatability)
         if gauge.categories < _CATEGORIES:
             marked.append(len(rows))
-        row = (
-            spoken(quantity.name),
-            f"{value} ({low} to {high}) {shown}",
-            amount(gauge.reproducibility, unit, 2, stated) if gauge.crossed else "not crossed",
-            amount(gauge.parts, unit, 2, stated),
-            str(gauge.categories),
-            f"{gauge.explained:.2f}{' *' if gauge.p_value * questions < _LEVEL else ''}",
+        rows.append(
+            (
+                spoken(quantity.name),
+                f"{value} ({low} to {high}) {shown}",
+                amount(gauge.reproducibility, unit, 2, stated) if gauge.crossed else "not crossed",
+                amount(gauge.parts, unit, 2, stated),
+                str(gauge.categories),
+                f"{gauge.explained:.2f}{' *' if gauge.p_value * questions < _LEVEL else ''}",
+            )
         )
-        rows.append(row)
     return Section(
         "Gauge: repeated recordings",
         [
@@ -262,7 +259,6 @@ def _to_draw(line: Line) -> list[tuple[FollowedQuantity, str]]:
 
 
 def _chart_figure(line: Line, drawn: list[tuple[FollowedQuantity, str]]) -> Figure:
-    """Draw control charts: values, moving average and limits above, moving ranges below."""
     drawing, rows = figures.stacked(2 * len(drawn), 1.5, 0.6, height_ratios=[2.2, 1] * len(drawn))
     for (quantity, station), above, below in zip(drawn, rows[::2], rows[1::2], strict=True):
         chart, places = quantity.charts[station]
@@ -278,8 +274,7 @@ def _chart_figure(line: Line, drawn: list[tuple[FollowedQuantity, str]]) -> Figu
         ):
             size = 4 if len(places) < 200 else 2.5
             dots = axes.plot(across, factor * values, "o", color=_VALUE, ms=size, alpha=0.6, mew=0, label="unit")
-            finite = np.isfinite(values)
-            named(dots[0], [line.table.devices[row] for row in places[finite]])
+            named(dots[0], [line.table.devices[row] for row in places[np.isfinite(values)]])
             axes.plot(across[hits], factor * values[hits], "D", color=_OUT, ms=5, label="beyond control limits")
             for end in ends:
                 line_of_end = axes.axhline(factor * end, color="#5C5C66", linestyle="--", linewidth=1)

@@ -33,7 +33,8 @@ def _lead(calibration: Calibration) -> tuple[str, str, str]:
     """Say how good a heading becomes, or how much the field's strength still scatters: sentence, number and meaning."""
     facts = calibration.magnetic
     assert facts is not None
-    spread, heading = facts["norm_spread"], facts["heading_error"]
+    spread = facts["norm_spread"]
+    heading = facts["heading_error"]
     strength = (
         f"the field's strength scatters by {100 * spread['after']:.2g} % instead of {100 * spread['before']:.2g} % on "
         "parts left out"
@@ -55,7 +56,8 @@ def _lead(calibration: Calibration) -> tuple[str, str, str]:
 
 def statements(calibration: Calibration) -> Iterator[Statement]:
     """Say what the field is, what the iron does, and where the field was seen."""
-    facts, triad = calibration.magnetic, calibration.imu.magnetometer
+    facts = calibration.magnetic
+    triad = calibration.imu.magnetometer
     assert facts is not None and triad is not None
     gain = np.asarray(triad.gain)
     strength, dip = facts["field"]["strength"], facts["field"]["dip"]
@@ -121,7 +123,6 @@ def next_words(plan: Json) -> str:
 
 
 def _along(direction: Sequence[float]) -> str:
-    """Name a direction by the axes that it lies between."""
     return "".join(
         ("+" if part > 0 else "−") + axis for part, axis in zip(direction, "xyz", strict=True) if abs(part) > 0.4
     )
@@ -153,7 +154,8 @@ def _figure(calibration: Calibration, measurement: MagneticField, heading: Headi
     windows = measurement.windows
     field = windows.field(calibration.imu)[windows.used]
     length = np.linalg.norm(field, axis=1)
-    off, span = 100 * (length / measurement.strength - 1), 0.98
+    off = 100 * (length / measurement.strength - 1)
+    span = 0.98
     figure = new_figure(3.6)
     limit = np.quantile(np.abs(off), span)
     panels, grid = hemispheres(
@@ -174,7 +176,8 @@ def _figure(calibration: Calibration, measurement: MagneticField, heading: Headi
     bar = figure.colorbar(axes.collections[0], cax=figure.add_subplot(grid[1, :2]), orientation="horizontal")
     bar.set_label("strength off after calibration (%)")
     if heading is not None:
-        axes, turned = figure.add_subplot(grid[:, 2]), np.append(heading.heading, 360.0)
+        axes = figure.add_subplot(grid[:, 2])
+        turned = np.append(heading.heading, 360.0)
         names = ["level", "rolled 45°", "rolled −45°", "pitched 45°", "pitched −45°", "upside down"]
         for row, name in zip(np.hypot(heading.sigma, heading.scatter), names, strict=True):
             axes.plot(turned, np.append(row, row[0]), label=name, linewidth=2.2 if name == "level" else 1.0)

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 def page_of(model: NoiseModel) -> Page:
     """Return each axis's white noise and the spread of its slow bias."""
-    rows, triads = [], {name: noise for name in INERTIAL_QUANTITIES if (noise := getattr(model, name)) is not None}
+    rows = []
+    triads = {name: noise for name in INERTIAL_QUANTITIES if (noise := getattr(model, name)) is not None}
     for name, noise in triads.items():
         for axis, white, slow in zip("xyz", noise.white, noise.variance.sum(axis=1), strict=True):
             rows.append((f"{name} {axis}", _density(name, white), size(float(np.sqrt(slow)), SENSOR_UNITS[name])))

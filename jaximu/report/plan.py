@@ -61,7 +61,6 @@ def _times(ratio: float) -> str:
 
 
 def _verdict(proposal: Proposal) -> Iterator[str]:
-    """Say how many times smaller the uncertainties become, and how many parameters all data together determine."""
     name = _parameter(proposal)
     what = "the uncertainties" if name is None else f"the uncertainty of the {describe(name, proposal.imu)}"
     average = " on average" * (name is None)
@@ -77,7 +76,6 @@ def _parameter(proposal: Proposal) -> Name | None:
 
 
 def _criterion(proposal: Proposal) -> str:
-    """Say what the criterion was, becomes, and what rounding the angles costs."""
     before, after = number(proposal.criterion_before), number(proposal.criterion_after)
     if _parameter(proposal) is None:
         text = f"The poses minimise {_CRITERIA[proposal.criterion]}, which falls from {before} to {after}."
@@ -90,7 +88,6 @@ def _criterion(proposal: Proposal) -> str:
 
 
 def _instructions(proposal: Proposal) -> Iterator[str]:
-    """Say how to hold the poses, and how to get from one to the next."""
     equipment = proposal.equipment
     yield f"Hold each pose for {equipment.rest:g} s, perfectly still."
     if equipment.by_hand:
@@ -114,7 +111,6 @@ def _instructions(proposal: Proposal) -> Iterator[str]:
 
 
 def _next(proposal: Proposal) -> str:
-    """Say what to run on the recording."""
     equipment = proposal.equipment
     if equipment.by_hand:
         command = "jaximu calibrate LOG -o RESULTS"
@@ -132,7 +128,6 @@ def _next(proposal: Proposal) -> str:
 
 
 def _poses(proposal: Proposal) -> Table:
-    """Return each pose's number, words and, where each turn leads from one pose to the next, the turn to it."""
     chained = proposal.equipment.chained
     turns = ["", *(turn.words for turn in proposal.turns)] if proposal.turns else [""] * len(proposal.poses)
     legend = "The top is the face that +z leaves, the bottom the one opposite."
@@ -163,8 +158,6 @@ def _turns(proposal: Proposal) -> Iterator[Section]:
 
 
 def _parameters(proposal: Proposal) -> Table:
-    """Return each parameter's 95 % interval before and after, and how many times smaller it becomes, best first."""
-
     def interval(name: Name, sigma: float) -> str:
         return f"± {spoken_amount(name, Z95 * sigma, proposal.imu)}"
 
@@ -187,7 +180,6 @@ def _parameters(proposal: Proposal) -> Table:
 
 
 def _picture(proposal: Proposal) -> Picture:
-    """Return the unit drawn in each pose."""
     equipment = proposal.equipment
     if equipment.by_hand:
         view = "The unit as the person who holds it sees it, a little from above."
@@ -234,7 +226,8 @@ def _poses_figure(proposal: Proposal) -> Figure:
         draw_unit(axes, Rotation.from_quat(pose.attitude, scalar_first=True).as_matrix())
         axes.set_title(f"{index}", loc="left", fontsize=12, fontweight="bold")
         axes.set_ylim(-2.6, 1.35)  # the words stand below
-        axes.text(0.0, -1.75, _folded(pose.words), ha="center", va="top", fontsize=9.5)
+        folded = "\n".join(line for part in pose.words.split("; ") for line in textwrap.wrap(part, 36))
+        axes.text(0.0, -1.75, folded, ha="center", va="top", fontsize=9.5)
     figure.suptitle(
         f"{count} poses {proposal.equipment.words}: {proposal.equipment.rest:g} s at rest in each",
         fontsize=12,
@@ -242,7 +235,3 @@ def _poses_figure(proposal: Proposal) -> Figure:
         y=1 - _ABOVE / figure.get_figheight(),
     )
     return figure
-
-
-def _folded(words: str) -> str:
-    return "\n".join(line for part in words.split("; ") for line in textwrap.wrap(part, 36))

@@ -74,18 +74,17 @@ def _page(
     notes: Sequence[str] = (),
     after: str = "",
 ) -> Page:
-    """Return the page of signals that are described by their facts: which sensors, at what rate, and for how long."""
     sensors = [name for name in signals if name in SENSORS.values()] or [*signals] or ["no signal"]
     longest = max(signals.values(), key=lambda facts: facts["samples"], default={"samples": 0})
     rate = duration = meaning = ""
     if longest["samples"] > 1:
-        rate, duration = f" at {longest['rate']:.5g} Hz", f"{longest['duration']:.5g} s"
+        rate = f" at {longest['rate']:.5g} Hz"
+        duration = f"{longest['duration']:.5g} s"
         meaning = f"from the first to the last of {longest['samples']} samples"
     return Page(title, (sentence(f"{listed(sensors)}{rate}."),), duration, meaning, parts, notes=notes, next=after)
 
 
 def _table(signals: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Return a row a signal: how it was sampled, and between which values it lies."""
     return Table(
         (
             "signal",
@@ -115,7 +114,6 @@ def _table(signals: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def _guess(guess: Mapping[str, Any] | None) -> Iterator[Part]:
-    """Return how the columns of a file that does not name them were understood, and the options that say it."""
     if guess is None:
         return
     blanks = ", fill in the ?" if "?" in guess["line"] else ""

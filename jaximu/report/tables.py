@@ -62,7 +62,8 @@ def snippet(calibration: Calibration) -> str:
     for name, triad in calibration.triads().items():
         if triad.effects:
             return ""
-        short, known = name[0], _INPUTS[name]
+        short = name[0]
+        known = _INPUTS[name]
         gain = (",\n" + 16 * " ").join(listed(row) for row in np.asarray(triad.gain))
         unit = "".join(letter for letter in triad.output_unit if letter.isprintable())
         lines += [
@@ -98,7 +99,8 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
     (gain, bias), (gain_sigma, bias_sigma) = map(np.asarray, (triad.gain, triad.bias)), calibration.sigma(name)
     fitted = {"gain": (gain, gain_sigma), "bias": (bias, bias_sigma)}
     nominal = None if calibration.nominal is None else getattr(calibration.nominal, name)
-    unit, si = unit_text(triad.output_unit), _INPUTS[name].si
+    unit = unit_text(triad.output_unit)
+    si = _INPUTS[name].si
     counts = unit != si
     per = f"{unit} per {si}" if counts else ""
     weak = {parameter for direction in calibration.weak for parameter, _ in direction.parameters}
@@ -126,7 +128,8 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
             return "by convention: fixes the body frame"
         if exchanged[i]:
             return _EXCHANGED
-        tilt, sigma = gain[i, j] / scale[i], _ratio_sigma(calibration, name, gain, i, j)
+        tilt = gain[i, j] / scale[i]
+        sigma = _ratio_sigma(calibration, name, gain, i, j)
         in_mrad = with_interval(1e3 * tilt, 1e3 * sigma, "mrad", sign=True)
         return f"{in_mrad} = {with_interval(tilt, sigma, 'rad', sign=True)}"
 
@@ -148,7 +151,8 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
         if (not counts or part == "gain") and 0 < abs(value) <= Z95 * sigma:
             meaning = f"{meaning}; not different from zero".removeprefix("; ")
         if parameter in calibration.open_numbers:
-            shown, meaning = with_interval(value, 0.0, per if part == "gain" else ""), "not determined"
+            shown = with_interval(value, 0.0, per if part == "gain" else "")
+            meaning = "not determined"
         words = describe(parameter).removeprefix(f"{name} ") + " *" * (parameter in weak)
         # a bias as it is put out: what the equation takes
         return short_name(parameter), words, shown + f" {unit}" * (part == "bias"), meaning
@@ -224,7 +228,8 @@ _METHODS = {
 
 def provenance(calibration: Calibration) -> list[tuple[str, str]]:
     """Return facts about the data, the method and the software, by name."""
-    data, gravity = calibration.data, calibration.gravity
+    data = calibration.data
+    gravity = calibration.gravity
     rates = [
         f"{name} {data[key]:.6g} Hz"
         for name, key in (("accelerometer", "rate"), ("gyroscope", "gyroscope_rate"))

@@ -50,7 +50,10 @@ def show(content: Page | Part, screen: Console | None = None) -> None:
             if brief is not None and len(rows) > brief:
                 screen.print(f"… and {len(rows) - brief} more in the report")
         case Items(texts=texts):
-            _print_items(texts, screen)
+            grid = Grid.grid(padding=(0, 1, 0, 0))
+            for words in texts:  # lines are indented below their bullets
+                grid.add_row("-", worded(sentence(words)))
+            screen.print(grid)
         case Code(text=lines):
             screen.print(indent(lines, "  "), soft_wrap=True)  # a folded line is no longer what is to be copied
         case Section(title=title, parts=parts):
@@ -70,14 +73,6 @@ def show(content: Page | Part, screen: Console | None = None) -> None:
 def _print_parts(parts: Sequence[Part], screen: Console) -> None:
     for part in filter(None, parts):
         show(part, screen)
-
-
-def _print_items(texts: Sequence[str], screen: Console) -> None:
-    """Print a list, its lines indented below their bullets."""
-    grid = Grid.grid(padding=(0, 1, 0, 0))
-    for words in texts:
-        grid.add_row("-", worded(sentence(words)))
-    screen.print(grid)
 
 
 def _print_table(table: Table, screen: Console) -> None:

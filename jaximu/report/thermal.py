@@ -87,7 +87,6 @@ def _parts(thermal: ThermalCalibration) -> str:
 
 
 def _verdict(thermal: ThermalCalibration) -> Iterator[str]:
-    """Say what temperature did to each sensor and what remains, and whether the recordings show more than one way."""
     jumps = ", jumps included" * bool(thermal.jumps)
     span = "{:.0f} and {:.0f} °C".format(*thermal.blocks.range).replace("-", "−")
     for name, fit in thermal.fits.items():
@@ -105,7 +104,6 @@ def _verdict(thermal: ThermalCalibration) -> Iterator[str]:
 
 
 def _number(thermal: ThermalCalibration) -> tuple[str, str]:
-    """Return what remains of the first corrected sensor on parts left out of the fit, and what that is."""
     corrected = [name for name, fit in thermal.fits.items() if fit.candidate.names]
     name = [*corrected, *thermal.fits][0]
     fit = thermal.fits[name]
@@ -127,8 +125,8 @@ def _band_picture(thermal: ThermalCalibration, name: str) -> Picture:
 
 
 def _remainder(thermal: ThermalCalibration) -> Table:
-    """Return rms over temperature, after the model, and on what was left out, axis by axis."""
-    rows, jumps = [], ", jumps included" * bool(thermal.jumps)
+    rows = []
+    jumps = ", jumps included" * bool(thermal.jumps)
     for name, fit in thermal.fits.items():
         factor, unit = _unit(thermal, name)
         sizes = factor * np.stack([fit.before, fit.after, fit.candidate.held.rms], axis=1)
@@ -145,7 +143,6 @@ def _remainder(thermal: ThermalCalibration) -> Table:
 
 
 def _model(thermal: ThermalCalibration, name: str) -> Statement:
-    """Say which effects model a sensor, and what remains on parts left out."""
     fit = thermal.fits[name]
     effects = [effect_title(f"{PREFIXES[name]}.{effect}") for effect in fit.candidate.names]
     before, after = (_size(name, held.rms) for held in (fit.held_before, fit.candidate.held))
@@ -158,7 +155,6 @@ def _model(thermal: ThermalCalibration, name: str) -> Statement:
 
 
 def _candidates(thermal: ThermalCalibration) -> Iterator[Part]:
-    """Return the models that were tried, and a regression where the ambient temperature is known."""
     for name in thermal.fits:
         yield Section(sentence(name), [candidate_table(thermal, name)], 3)
     yield (
@@ -197,7 +193,8 @@ def candidate_table(thermal: ThermalCalibration, name: str) -> Table:
 
 def effect_table(calibration: Calibration) -> Table:
     """Return effects' coefficients ± 95 %, three a row, and each inner parameter, of curves the largest change."""
-    rows, document = [], calibration.document()
+    rows = []
+    document = calibration.document()
     curves = False
     effects = ((owner, *effect) for owner in calibration.triads() for effect in document[owner]["effects"].items())
     for triad, name, entry in effects:
@@ -223,7 +220,6 @@ def effect_table(calibration: Calibration) -> Table:
 
 
 def _coefficient_rows(title: str, entry: Json) -> list[tuple[str, ...]]:
-    """Return an effect's coefficients, three a row, with intervals where they are known."""
     coefficients = entry["coefficients"]
     sigma = entry["sigma"] or [0.0] * len(coefficients)
     factor, unit = readable(entry["unit"], max(map(abs, coefficients)))
@@ -293,7 +289,6 @@ def _rest(thermal: ThermalCalibration) -> Iterator[Part]:
 
 
 def _ways(thermal: ThermalCalibration) -> list[Part]:
-    """Say which ramp to run next, where the path hardly separates some effect."""
     weak = [name for name, part in thermal.identifiability.parts.items() if part.apart < ENOUGH]
     if not weak:
         return []
@@ -338,7 +333,8 @@ def _ambient(thermal: ThermalCalibration) -> Iterator[Statement]:
     for name, fit in thermal.fits.items():
         added = blocks.means[name] - fit.level.T[blocks.level]
         fits = [multifactor(factors, values) for values in added.T]
-        held, kept = np.array([rms for _, rms in fits]), max(len(terms) for terms, _ in fits)
+        held = np.array([rms for _, rms in fits])
+        kept = max(len(terms) for terms, _ in fits)
         yield Statement(
             f"Regression of the {name} on sensor and ambient temperature and their rates",
             f"At most {kept} of 15 terms kept: {_size(name, held)} rms on fifths left out, against "
@@ -364,7 +360,8 @@ def loss_words(parameters: AutopilotParameters, thermal: ThermalCalibration) -> 
 
 def residual_dots(thermal: ThermalCalibration, name: str) -> FloatArray:
     """Return what the model leaves of each block (n, 3), SI, about its mean at each level: jumps are no residuals."""
-    residual, level = thermal.fits[name].residual, thermal.blocks.level
+    residual = thermal.fits[name].residual
+    level = thermal.blocks.level
     mean = np.stack([np.bincount(level, axis) / np.bincount(level) for axis in residual.T], axis=1)
     return residual - mean[level]
 
@@ -385,7 +382,8 @@ def _both_ways(thermal: ThermalCalibration) -> list[tuple[np.ndarray, dict[str, 
 
 def _within_data(thermal: ThermalCalibration, temperature: FloatArray, rates: FloatArray) -> np.ndarray:
     """Return at which rates and temperatures (r, m) there are blocks, or blocks on either side at that temperature."""
-    blocks, margin = thermal.blocks, _BESIDE_DATA * np.ptp(rates)
+    blocks = thermal.blocks
+    margin = _BESIDE_DATA * np.ptp(rates)
     near = np.abs(temperature[:, None] - blocks.temperature) < _BESIDE_DATA * np.ptp(temperature)
     low = np.where(near, blocks.rate, np.inf).min(axis=1) - margin
     high = np.where(near, blocks.rate, -np.inf).max(axis=1) + margin
@@ -411,7 +409,8 @@ def surface_figure(thermal: ThermalCalibration, name: str) -> Figure:
     rates = np.linspace(blocks.rate.min(), blocks.rate.max(), 41)
     surface = np.stack([thermal.bias(name, temperature, rate)[0] for rate in rates])  # (r, m, 3)
     drawn = _within_data(thermal, temperature, rates)
-    data, parts = bias_dots(thermal, name), _both_ways(thermal)
+    data = bias_dots(thermal, name)
+    parts = _both_ways(thermal)
     x, y = np.meshgrid(temperature, 60 * rates)
     for axis in range(3):
         panel: Any = figure.add_subplot(1, 3, axis + 1, projection="3d")
@@ -440,7 +439,8 @@ def band_figure(thermal: ThermalCalibration, name: str) -> Figure:
     factor, unit = _unit(thermal, name)
     temperature = np.linspace(*thermal.blocks.range, 201)
     value, sigma = thermal.bias(name, temperature)
-    data, parts = bias_dots(thermal, name), _both_ways(thermal)
+    data = bias_dots(thermal, name)
+    parts = _both_ways(thermal)
     figure = new_figure(3.4)
     for axis, panel in enumerate(figure.subplots(1, 3)):
         for part, style in parts:
@@ -456,8 +456,10 @@ def band_figure(thermal: ThermalCalibration, name: str) -> Figure:
 def residual_figure(thermal: ThermalCalibration, name: str) -> Figure:
     """Draw what the model leaves of each block against temperature and time, up and down in two colours."""
     factor, unit = _unit(thermal, name)
-    blocks, residual = thermal.blocks, factor * residual_dots(thermal, name)
-    figure, parts = new_figure(6.0), _both_ways(thermal)
+    blocks = thermal.blocks
+    residual = factor * residual_dots(thermal, name)
+    figure = new_figure(6.0)
+    parts = _both_ways(thermal)
     grid = figure.subplots(3, 2, sharey="row", sharex="col")
     for axis in range(3):
         for panel, x in zip(grid[axis], (blocks.temperature, blocks.time / 3600), strict=True):
@@ -476,7 +478,8 @@ def residual_figure(thermal: ThermalCalibration, name: str) -> Figure:
 
 def covered_figure(thermal: ThermalCalibration) -> Figure:
     """Draw the temperatures and rates that the recordings went through."""
-    blocks, figure = thermal.blocks, new_figure(3.4)
+    blocks = thermal.blocks
+    figure = new_figure(3.4)
     left, right = figure.subplots(1, 2)
     for part, style in _both_ways(thermal):
         left.plot(blocks.temperature[part], 60 * blocks.rate[part], ".", ms=4, **style)

@@ -38,7 +38,6 @@ def page_of(thermal: HandHeldThermal) -> Page:
 
 
 def _verdict(thermal: HandHeldThermal) -> list[str]:
-    """Say which effects of temperature improve the prediction of parts left out."""
     between = "between {:.0f} and {:.0f} °C".format(*thermal.range).replace("-", "−")
     titles = [CATALOGUE[name].english for name, *_ in thermal.steps]
     if not titles:
@@ -51,7 +50,6 @@ def _verdict(thermal: HandHeldThermal) -> list[str]:
 
 
 def _sizes(thermal: HandHeldThermal) -> list[tuple[str, float, float, str]]:
-    """Return each kind of error in words, its rms without and with the effects, and the unit."""
     before, after = (thermal.experiment.real.rms(state.conditions) for state in (thermal.base, thermal.state))
     return [
         (kind.words, before[kind.name][0], after[kind.name][0], kind.unit) for kind in thermal.experiment.real.kinds
@@ -59,7 +57,6 @@ def _sizes(thermal: HandHeldThermal) -> list[tuple[str, float, float, str]]:
 
 
 def _number(thermal: HandHeldThermal) -> tuple[str, str]:
-    """Return the first kind of error with the effects, and what it is."""
     _, before, after, unit = _sizes(thermal)[0]
     if not thermal.steps:
         return size(after, unit), "error against gravity at rest, rms over all temperatures"
@@ -68,7 +65,6 @@ def _number(thermal: HandHeldThermal) -> tuple[str, str]:
 
 
 def _first(thermal: HandHeldThermal) -> Iterator[Part]:
-    """Return bias and scale over temperature, the errors, the effects and what may still hide."""
     reference = f"{thermal.calibration.imu.accelerometer.temperature_reference:g} °C"
     if _changed(thermal):
         yield Picture(
@@ -90,22 +86,20 @@ def _first(thermal: HandHeldThermal) -> Iterator[Part]:
             [(sentence(words), changed(before, after, unit)) for words, before, after, unit in _sizes(thermal)],
         )
         yield Section("Effects", [effect_table(thermal.calibration)])
-    yield Section("What may still hide", [*_limits(thermal)])
-
-
-def _limits(thermal: HandHeldThermal) -> Iterator[Part]:
-    """Return the smallest effects that would have been found, and those that the recordings do not determine."""
-    yield Table(
+    limits = Table(
         ("effect", "size that could hide", "at the end of the range"),
         _limit_rows(thermal),
         "Effects that were tested and are not needed. Larger ones would have been found nine times in ten.",
     )
-    for name, why in thermal.undetermined.items():
-        yield Statement(sentence(effect_title(name)), f"Not determined: {why}.", True)
-    yield (
+    undetermined = [
+        Statement(sentence(effect_title(name)), f"Not determined: {why}.", True)
+        for name, why in thermal.undetermined.items()
+    ]
+    untested = (
         "The rate of temperature, a lag and a hysteresis are not tested in poses by hand: record ramps at rest for "
         "them."
     )
+    yield Section("What may still hide", [limits, *undetermined, untested])
 
 
 def _limit_rows(thermal: HandHeldThermal) -> list[tuple[str, ...]]:
@@ -136,8 +130,8 @@ def _changed(thermal: HandHeldThermal) -> list[tuple[str, str, tuple[str, ...], 
 
 
 def _change_figure(thermal: HandHeldThermal) -> Figure:
-    """Draw bias and scale over temperature with their 95 % bands."""
-    temperature, calibration = np.linspace(*thermal.range, 101), thermal.calibration
+    temperature = np.linspace(*thermal.range, 101)
+    calibration = thermal.calibration
     drawn = []
     for owner, word, names, force in _changed(thermal):
         scale = calibration.triads()[owner].scales
@@ -159,7 +153,6 @@ def _change_figure(thermal: HandHeldThermal) -> Figure:
 
 
 def _error_figure(thermal: HandHeldThermal) -> Figure:
-    """Draw the errors of poses and turns over temperature, without and with the effects."""
     real = thermal.experiment.real
     poses = real.of_kind("gravity_norm")
     temperature = np.full(len(real.spans), np.nan)
@@ -183,10 +176,17 @@ def _error_figure(thermal: HandHeldThermal) -> Figure:
 
 
 def _rest(thermal: HandHeldThermal) -> list[Section]:
-    """Return what each effect gained."""
     rows = [(effect_title(name), f"{statistic:.0f}", f"{gain:+.1f}") for name, statistic, gain in thermal.steps]
-    caption = (
-        "In the order in which they were taken in: χ² of the score test when tested, and log-likelihood gained on "
-        "parts left out."
-    )
-    return [Section("What each effect gained", [Table(("effect", "χ²", "gain, nats"), rows, caption)])]
+    return [
+        Section(
+            "What each effect gained",
+            [
+                Table(
+                    ("effect", "χ²", "gain, nats"),
+                    rows,
+                    "In the order in which they were taken in: χ² of the score test when tested, and log-likelihood "
+                    "gained on parts left out.",
+                )
+            ],
+        )
+    ]

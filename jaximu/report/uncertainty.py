@@ -42,7 +42,8 @@ def steady(up: FloatArray, gravity: float, temperature: Any, rate: FloatArray | 
 
     **Arguments:** `up` (n, 3): which way is up in the body; `gravity`: m/s²; `temperature`: °C; `rate` (n, 3): rad/s.
     """
-    nothing, none = np.zeros(len(up)), np.zeros_like(up)
+    nothing = np.zeros(len(up))
+    none = np.zeros_like(up)
     return Stimulus(
         specific_force=gravity * up,
         angular_rate=none + rate,
@@ -120,7 +121,8 @@ def over_sphere(known: Known, rest: Rest) -> FloatArray:
 def _at_rest(calibration: Calibration, half: FloatArray) -> Iterator[str]:
     """Say where the corrected force is least certain, and what that means; `half`: over the sphere."""
     (inside, points), gravity = _map_points(), calibration.gravity
-    directions, half = points[:, inside].reshape(-1, 3), half[:, inside].reshape(-1)
+    directions = points[:, inside].reshape(-1, 3)
+    half = half[:, inside].reshape(-1)
     worst = int(half.argmax())
     where = f"the direction {direction_words(directions[worst])}"
     if not np.isfinite(half).all():
@@ -143,13 +145,11 @@ def _at_rest(calibration: Calibration, half: FloatArray) -> Iterator[str]:
 
 def _rate_known(calibration: Calibration, extent: Range, rates: FloatArray) -> FloatArray:
     """Return half the 95 % interval (n,) of the corrected rate, °/s, z up while turning at rates (n, 3), rad/s."""
-    up = np.tile([0.0, 0.0, 1.0], (len(rates), 1))
-    stimulus = steady(up, extent.gravity, np.mean(extent.temperature), rates)
+    stimulus = steady(np.tile([0.0, 0.0, 1.0], (len(rates), 1)), extent.gravity, np.mean(extent.temperature), rates)
     return Z95 * np.degrees(calibration.uncertainty_of(stimulus)["gyroscope"].largest)
 
 
 def _turning(calibration: Calibration, extent: Range) -> str:
-    """Say how well the corrected rate is known at rest, and at the end of the range about the worst axis."""
     half = _rate_known(calibration, extent, np.concatenate([np.zeros((1, 3)), extent.rate * _FACES]))
     worst = 1 + int(half[1:].argmax())
     still, turning = (
@@ -257,7 +257,8 @@ def sphere_figure(
     inside, points = _map_points()
     finite = half[np.isfinite(half)]
     factor, unit = readable("m/s^2", float(finite.max()))
-    best, worst = factor * float(finite.min()), factor * float(finite.max())
+    best = factor * float(finite.min())
+    worst = factor * float(finite.max())
     span = (min(best, _LEAST_RANGE * worst), worst) if most is None else (0.0, factor * max(most, float(finite.max())))
     half = factor * half
     levels = MaxNLocator(8, steps=[1, 2, 2.5, 5, 10]).tick_values(*span)

@@ -48,7 +48,6 @@ def page_of(validity: Validity) -> Page:
 
 
 def _number(validity: Validity) -> tuple[str, str]:
-    """Return the error of the output with its interval where it is known, else the probability, and what it is."""
     moved = [shift.parameter.owner for shift in validity.moved if shift.parameter.owner in validity.output_errors]
     triad = (*moved, "accelerometer")[0]
     error = validity.output_errors.get(triad)
@@ -69,34 +68,26 @@ def _shifts(validity: Validity) -> Iterator[Part]:
             "(gains at 1 g and 1 rad/s), with the 95 % interval of the difference. Coloured: moved, with all "
             "parameters allowed for.",
         )
-    yield _shifts_table(validity)
-
-
-def _shifts_table(validity: Validity) -> Table:
-    """Return each parameter's old value, its shift, and that in the output, the most significant first."""
     statistic, freedom, p_value = validity.difference
     together = f"All {freedom} together: χ² {statistic:.1f}, p {probability(p_value)}." if freedom else ""
     moved = range(len(validity.moved))
-    return Table(
+    shifts = sorted(validity.shifts, key=lambda shift: (not shift.moved, -abs(shift.z) if shift.tested else 0.0))
+    yield Table(
         ("parameter", "old", "shift ± 95 %", "in the output ± 95 %", "σ", "p-value, all allowed for"),
-        [_shift_row(shift) for shift in sorted(validity.shifts, key=_rank)],
+        [_shift_row(shift) for shift in shifts],
         together,
         moved,
         brief=max(3, len(moved)),
     )
 
 
-def _rank(shift: Shift) -> tuple[bool, float]:
-    return not shift.moved, -abs(shift.z) if shift.tested else 0.0
-
-
 def _shift_row(shift: Shift) -> tuple[str, ...]:
+    known = shift.words, number(shift.old, 6)
     if not shift.comparable:
-        return shift.words, number(shift.old, 6), "not determined here", "", "", ""
+        return *known, "not determined here", "", "", ""
     if not shift.tested:
-        return shift.words, number(shift.old, 6), shift.amount, shift.output, "", "differs after every power-on"
-    p_value = probability(shift.p_value).removeprefix("= ")
-    return shift.words, number(shift.old, 6), shift.amount, shift.output, f"{abs(shift.z):.1f}", p_value
+        return *known, shift.amount, shift.output, "", "differs after every power-on"
+    return *known, shift.amount, shift.output, f"{abs(shift.z):.1f}", probability(shift.p_value).removeprefix("= ")
 
 
 def _statements(validity: Validity) -> Iterator[Statement]:
@@ -176,25 +167,21 @@ def _shifts_figure(validity: Validity) -> Figure:
 
 
 def _errors(validity: Validity, experiment: Experiment) -> Figure:
-    """Conditions of poses and turns under both calibrations."""
     figure = figures.new_figure(3.4)
     panels = figure.subplots(1, 2)
     real = experiment.real
-    norms, turns = real.of_kind("gravity_norm"), real.of_kind("gravity_direction")
+    norms = real.of_kind("gravity_norm")
+    turns = real.of_kind("gravity_direction")
     times = real.covariates[TIME][norms], real.covariates[TIME][turns][::2]
-    extended = [cause.title for cause in validity.causes if cause.scope != "parameter"]
-    fresh = " with ".join(["fresh calibration", *([", ".join(extended)] if extended else [])])
-    for (label, colour), conditions in zip(
-        (("old calibration", figures.FLAGGED), (fresh, figures.AFTER)), validity.conditions, strict=True
-    ):
-        norm = 1e3 * conditions[norms]
-        for panel, time, values in zip(
-            panels, times, (norm, np.degrees(np.linalg.norm(conditions[turns].reshape(-1, 2), axis=1))), strict=True
-        ):
+    extended = ", ".join(cause.title for cause in validity.causes if cause.scope != "parameter")
+    fresh = "fresh calibration" + f" with {extended}" * bool(extended)
+    labels = ("old calibration", figures.FLAGGED), (fresh, figures.AFTER)
+    for (label, colour), conditions in zip(labels, validity.conditions, strict=True):
+        angles = np.degrees(np.linalg.norm(conditions[turns].reshape(-1, 2), axis=1))
+        for panel, time, values in zip(panels, times, (1e3 * conditions[norms], angles), strict=True):
             panel.plot(time, values, "o", color=colour, markersize=4, label=label)
-    for panel, title, unit in zip(
-        panels, ("gravity norm at rest", "gravity carried over a turn"), ("mm/s²", "°"), strict=True
-    ):
+    titles = ("gravity norm at rest", "gravity carried over a turn")
+    for panel, title, unit in zip(panels, titles, ("mm/s²", "°"), strict=True):
         zero_line(panel)
         figures.dressed(panel, title, xlabel="time [s]", ylabel=f"error [{unit}]")
         legend(panel)

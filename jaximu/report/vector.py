@@ -84,7 +84,8 @@ def _mark(figure: Figure) -> dict[str, dict[str, str]]:
     from matplotlib.collections import PathCollection
     from matplotlib.patches import Patch
 
-    attributes, counts = {}, []
+    attributes = {}
+    counts = []
     for panel, axes in enumerate(figure.axes):
         axes.set_gid(f"panel {panel}")
         lines = [line for line in axes.lines if line.get_transform() == axes.transData]

@@ -31,7 +31,7 @@ def vehicle_page(calibration: Calibration, history: History) -> Page:
         [
             Picture(
                 "vehicle",
-                partial(_figure, calibration, history),
+                partial(_figure, calibration, vehicle, history),
                 "Gyroscope bias and tilt at each stop, and the speeds gained and lost beside stops",
                 "Top: the bias as a filter knew it after each stop, with 95 % bands. Middle: how much more than on "
                 "average the vehicle tilts at each stop, which is the slope of the road. Bottom: speeds gained in the "
@@ -49,7 +49,6 @@ def vehicle_page(calibration: Calibration, history: History) -> Page:
 
 
 def _statements(calibration: Calibration, vehicle: Mapping[str, Any]) -> Iterator[Part]:
-    """Say how the unit is mounted, what gravity and the Earth's rotation show, and how the bias changed."""
     yield Statement("Mounting", _mounting(vehicle))
     if (yaw := vehicle["yaw"]) is not None:
         share = f"{100 * vehicle['forward_share']:.0f} %"
@@ -78,7 +77,6 @@ def _statements(calibration: Calibration, vehicle: Mapping[str, Any]) -> Iterato
 
 
 def _interval(entry: Mapping[str, Any], sign: bool = False) -> str:
-    """Return a number with its interval, or without one where it has none."""
     if entry["sigma"] is None:
         return f"{size(entry['value'], entry['unit'])} (without an interval)"
     return with_interval(entry["value"], entry["sigma"], entry["unit"], sign)
@@ -87,7 +85,8 @@ def _interval(entry: Mapping[str, Any], sign: bool = False) -> str:
 def _mounting(vehicle: Mapping[str, Any]) -> str:
     slope = vehicle["slope"]
     known = "" if slope is None else f" The road at the stops sloped by {size(slope, 'rad', 2)} (rms), which is in it."
-    roll, pitch = vehicle["roll"]["value"], vehicle["pitch"]["value"]
+    roll = vehicle["roll"]["value"]
+    pitch = vehicle["pitch"]["value"]
     up = np.array([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])  # in the unit
     axis = int(np.abs(up).argmax())
     return (
@@ -112,9 +111,7 @@ def _earth(calibration: Calibration) -> str:
     )
 
 
-def _figure(calibration: Calibration, history: History) -> Figure:
-    assert calibration.filter is not None
-    vehicle = calibration.filter["vehicle"]
+def _figure(calibration: Calibration, vehicle: Mapping[str, Any], history: History) -> Figure:
     scale = calibration.triads()["gyroscope"].scales
     figure, (bias, tilt, speed) = stacked(3, 2.5, 0.0)
     for row, (axis, color) in enumerate(AXES.items()):

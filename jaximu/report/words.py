@@ -78,23 +78,24 @@ def trust(calibration: Calibration) -> Iterator[Statement]:
         yield new_poses(calibration)
     yield from gravity_statements(calibration)
     if not by_hand and "poses" in calibration.data:
-        text = (
+        yield Statement(
+            "The set-up",
             "What the set-up gets wrong every time (a table that is not level, axes that are not square, a wrong "
-            "angle) shifts the parameters by as much and is in no interval; `jaximu budget` computes how much."
+            "angle) shifts the parameters by as much and is in no interval; `jaximu budget` computes how much.",
+            not calibration.imu.setup,
         )
-        yield Statement("The set-up", text, not calibration.imu.setup)
     if calibration.method.startswith("two-step"):
-        text = (
+        yield Statement(
+            "Method",
             "The gyroscope was fitted with the accelerometer held fixed: its intervals leave out what the "
-            "accelerometer's uncertainty adds."
+            "accelerometer's uncertainty adds.",
         )
-        yield Statement("Method", text)
-    text = (
+    yield Statement(
+        "Two kinds of error",
         "The intervals are sampling error: how far the numbers would scatter if the same unit were recorded again in "
         "the same way. Model error is another thing: what this model (scale, misalignment and bias, near "
-        f"{_temperature(calibration)}, at these rates and accelerations) leaves out. No interval contains it."
+        f"{_temperature(calibration)}, at these rates and accelerations) leaves out. No interval contains it.",
     )
-    yield Statement("Two kinds of error", text)
 
 
 def scatter_statements(calibration: Calibration) -> list[Statement]:
@@ -135,23 +136,26 @@ def new_poses(calibration: Calibration) -> Statement:
     poses, _ = counts(calibration)
     fitted = sum(name.owner == "accelerometer" for name in calibration.names)
     if poses <= fitted + 2:
-        text = (
+        return Statement(
+            "New poses",
             f"{poses} poses leave hardly any degrees of freedom to check {fitted} numbers by: however small the errors "
-            "above, they do not show that the calibration is right. Record more poses."
+            "above, they do not show that the calibration is right. Record more poses.",
+            True,
         )
-        return Statement("New poses", text, True)
     grown = np.sqrt((poses + fitted) / (poses - fitted))
-    text = (
+    return Statement(
+        "New poses",
         f"The errors above are those of the poses that were fitted. {fitted} numbers of the accelerometer were chosen "
         f"to suit {poses} poses, so poses that were not fitted should show roughly {grown:.1f} times as much, about "
-        f"{size(grown * calibration.rms['gravity_norm'][1], 'm/s^2', 2)} (rms)."
+        f"{size(grown * calibration.rms['gravity_norm'][1], 'm/s^2', 2)} (rms).",
+        poses < 2 * fitted,
     )
-    return Statement("New poses", text, poses < 2 * fitted)
 
 
 def gravity_statements(calibration: Calibration) -> Iterator[Statement]:
     """Say how far gravity leaves the scales uncertain; nothing where they are known from other forces."""
-    gravity, triads = calibration.gravity, calibration.triads()
+    gravity = calibration.gravity
+    triads = calibration.triads()
     if "accelerometer" not in triads:
         return
     if not gravity.sigma > 0:

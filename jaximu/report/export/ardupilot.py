@@ -62,7 +62,8 @@ class ArduPilot(Firmware):
 
     def thermal(self, file: ParameterFile, triad: str, number: int, celsius: float | None) -> FloatArray:
         """p(T) − p(T_cal), p = 1e-6 (c1 d + c2 d² + c3 d³), d = T − 35 °C."""
-        stem, short = f"INS_TCAL{number + 1}_", _SHORT[triad]
+        stem = f"INS_TCAL{number + 1}_"
+        short = _SHORT[triad]
         if file.value(f"{stem}ENABLE", 0.0) != 1:
             return np.zeros(3)
         celsius = need_temperature(file, f"{stem}ENABLE", celsius)

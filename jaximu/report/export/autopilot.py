@@ -45,13 +45,16 @@ class Autopilot:
             triad = logged.of_sensor(of_log)
             if name == "magnetometer":
                 axes = signed_axes(triad)
-                matrix, shift = symmetric_matrix(triad, axes), self.unit[1] * triad.bias
+                matrix = symmetric_matrix(triad, axes)
+                shift = self.unit[1] * triad.bias
                 corrections[name] = Correction(matrix, triad.bias, frame=axes.T)
                 if self.rotated:
-                    matrix, shift = axes @ matrix @ axes.T, -axes @ shift
+                    matrix = axes @ matrix @ axes.T
+                    shift = -axes @ shift
                 parts = (shift, np.diag(matrix), matrix[[0, 0, 1], [1, 2, 2]])
                 written = dict(zip(self.matrix, parts, strict=True))
-                word, sign = self.matrix[0], "+" if self.rotated else "-"
+                word = self.matrix[0]
+                sign = "+" if self.rotated else "-"
                 equation += [f"h [{self.unit[0]}] = S (y {sign} {word}), S = {matrix_text(matrix)}"]
                 equation += [f"{word} = {vector_text(shift)}"]
                 if not np.array_equal(axes, np.eye(3)):

@@ -25,9 +25,12 @@ _MATRIX_BITS = 24
 
 def write(parameters: ExportedUnit) -> Written:
     """Write three functions a triad: `jaximu_<triad>`, `…_float`, `…_fixed`, each (const y[3], u[3])."""
-    body, remarks = [], []
+    body = []
+    remarks = []
+    gravity = parameters.calibration.gravity.value
+    extents = {"accelerometer": gravity, "gyroscope": math.radians(250.0), "magnetometer": 100.0}
     for name, triad in parameters.triads.items():
-        text, bound = _functions(name, triad, _extent(parameters, name))
+        text, bound = _functions(name, triad, extents[name])
         body.append(text)
         remarks.append(f"{bound:.2g} {SENSOR_UNITS[name]}")
     text = "\n".join(
@@ -43,20 +46,19 @@ def write(parameters: ExportedUnit) -> Written:
             "",
         ]
     )
-    convention = (
+    return Written(
+        {"": text.encode()},
         "inverse: u = T (y - b), the exact inverse of the gain, y in output units. The fixed-point functions are off "
-        f"by at most {' and '.join(remarks)} at gravity, at 250 deg/s and at 100 uT, float by some 1e-6 of a value."
+        f"by at most {' and '.join(remarks)} at gravity, at 250 deg/s and at 100 uT, float by some 1e-6 of a value.",
+        parameters.equation(),
+        parameters.corrections(),
     )
-    return Written({"": text.encode()}, convention, parameters.equation(), parameters.corrections())
-
-
-def _extent(parameters: ExportedUnit, name: str) -> float:
-    return {"accelerometer": parameters.calibration.gravity.value, "gyroscope": math.radians(250.0)}.get(name, 100.0)
 
 
 def _functions(name: str, triad: LinearTriad, extent: float) -> tuple[str, float]:
     """The three functions of a triad, and the bound of the fixed-point error for inputs up to `extent`, SI."""
-    matrix, offset = triad.inverse, triad.bias
+    matrix = triad.inverse
+    offset = triad.bias
     input_bits = 0 if triad.unit == "count" else INPUT_BITS
     out = OUTPUT_BITS[name]
     # matrix entries are kept as integers of 24 bits: M 2^(out - given + more)

@@ -43,12 +43,11 @@ class Range:
     ) -> Range:
         """The range of a calibration: 250 °/s, and 20 K about the temperature that it holds for, unless stated."""
         about = float(calibration.data.get("temperature", calibration.imu.accelerometer.temperature_reference))
-        field = None if calibration.magnetic is None else float(calibration.magnetic["field"]["strength"]["value"])
         return cls(
             calibration.gravity.value,
             rate or np.radians(250.0),
             temperature or (about - 20.0, about + 20.0),
-            field=field,
+            field=None if calibration.magnetic is None else float(calibration.magnetic["field"]["strength"]["value"]),
         )
 
     def text(self) -> str:
@@ -66,13 +65,15 @@ class Range:
         that one compiled function serves both.
         """
         time = np.arange(_SAMPLES) * (60.0 / _SAMPLES)
-        tilt, turn = np.pi * time / 60.0, 2 * np.pi * time / 3.7
+        tilt = np.pi * time / 60.0
+        turn = 2 * np.pi * time / 3.7
         up = np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], 1)
         frequency = np.array([0.31, 0.43, 0.59]) * 2 * np.pi
         share = 0.2 + 0.8 * np.eye(3)[(time // 5).astype(int) % 3]
         share *= 10.0 ** -np.maximum(time - 54.0, 0.0)[:, None]  # down to rates that a dead band swallows
         angle = frequency * time[:, None]
-        force, rate = self.gravity * up, self.rate * share * np.sin(angle)
+        force = self.gravity * up
+        rate = self.rate * share * np.sin(angle)
         low, high = self.temperature
         still = np.zeros((_SAMPLES, 3))
         swing = 1.0 - np.abs(1.0 - time / 30.0)

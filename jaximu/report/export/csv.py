@@ -27,7 +27,8 @@ def write(parameters: ExportedUnit) -> Written:
         # signed permutations take standard deviations along without signs
         map_, frame = (np.abs(axes[name]) for axes in (parameters.maps, parameters.frames))
         gain_sigma, bias_sigma = parameters.calibration.sigma(name)
-        gain_sigma, bias_sigma = map_.T @ gain_sigma @ frame, map_.T @ bias_sigma
+        gain_sigma = map_.T @ gain_sigma @ frame
+        bias_sigma = map_.T @ bias_sigma
         for index, value in np.ndenumerate(triad.gain):
             add(name, "gain", index, value, float(gain_sigma[index]), f"{triad.unit}/({SENSOR_UNITS[name]})")
         for index, value in np.ndenumerate(triad.bias):

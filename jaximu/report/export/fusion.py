@@ -25,9 +25,11 @@ def write(parameters: ExportedUnit) -> Written:
     """Write a constant for each argument, named as Fusion names it."""
     parameters.require_own_axes()
     lines = [comments(parameters, "//"), "#pragma once", '#include "Fusion.h"', ""]
-    equation, made = [], {}
+    equation = []
+    made = {}
     for name, triad in parameters.triads.items():
-        inverse, offset = triad.inverse, triad.bias
+        inverse = triad.inverse
+        offset = triad.bias
         unit, factor = _FED.get(name, ("uT", 1.0))
         lines.append(f"// {name}: y in {triad.unit}, the answer in {unit}")
         if name in _FED:
@@ -50,11 +52,13 @@ def write(parameters: ExportedUnit) -> Written:
                 f"{name}: h [uT] = S (y - b), y in {triad.unit}\nS = {matrix_text(inverse)}\nb = {vector_text(offset)}"
             )
             made[name] = Correction(inverse, offset)
-    convention = (
+    return Written(
+        text_file(lines),
         "inverse: u = M s (y - b), M with a unit diagonal, s diagonal, in g and deg/s as Fusion is fed; h = S (y - b) "
-        "in uT. FusionAxesSwap, where it is used, comes after."
+        "in uT. FusionAxesSwap, where it is used, comes after.",
+        "\n".join(equation),
+        made,
     )
-    return Written(text_file(lines), convention, "\n".join(equation), made)
 
 
 def _vector(name: str, values: FloatArray) -> str:

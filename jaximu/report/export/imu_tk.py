@@ -18,7 +18,8 @@ SUMMARY = "imu_tk: one .calib a triad (…_acc, …_gyro)"
 def write(parameters: ExportedUnit) -> Written:
     """Write the accelerometer's and the gyroscope's file; no comments, which imu_tk could not read."""
     parameters.require_own_axes()
-    files, equation = {}, []
+    files = {}
+    equation = []
     for name, ending in (("accelerometer", "_acc"), ("gyroscope", "_gyro")):
         triad = parameters.triads.get(name)
         if triad is None:
@@ -32,9 +33,11 @@ def write(parameters: ExportedUnit) -> Written:
             f"{name}: u = T K (y - b)\nT = {matrix_text(misalignment)}\nK = diag {vector_text(scale)}"
             f"\nb = {vector_text(bias)}"
         )
-    convention = (
+    return Written(
+        files,
         "inverse: u = T K (y - b), T with a unit diagonal, K diagonal in SI units per output unit, b in output units. "
         "The body frame is the calibration's, so T is a full matrix where imu_tk's own accelerometer has an "
-        "upper-triangular one."
+        "upper-triangular one.",
+        "\n".join(equation),
+        parameters.corrections(),
     )
-    return Written(files, convention, "\n".join(equation), parameters.corrections())

@@ -87,7 +87,8 @@ class Composition:
         half_width: of the 95 % interval of `new`; None where no recording determined it. at_rest: what it changes at
         rest, where that is most: `force` (m/s²) and `horizon` (rad), or `rate` (rad/s).
         """
-        changes, gravity = [], self.unit.calibration.gravity.value
+        changes = []
+        gravity = self.unit.calibration.gravity.value
         data_sheet = self.unit.calibration.from_data_sheet
         for name in self.unit.triads:
             (_, scale_before), (_, scale) = self._correction(name, self.file), self._correction(name, self._new)
@@ -114,7 +115,8 @@ class Composition:
 
     def at_rest(self) -> dict[str, float]:
         """Return what all changes amount to together at rest, at most over all attitudes, as in `changes`."""
-        gravity, amounts = self.unit.calibration.gravity.value, {}
+        gravity = self.unit.calibration.gravity.value
+        amounts = {}
         up = np.asarray(Range.of(self.unit.calibration).paths()[0].specific_force) / gravity
         for name in self.unit.triads:
             (offset, scale), (new_offset, new_scale) = (self._correction(name, of) for of in (self.file, self._new))
@@ -196,7 +198,8 @@ class Composition:
     def _sigmas(self) -> dict[str, float]:
         """One sigma of each parameter: by central differences over the calibration's gains and biases."""
         calibration, write, small = self.unit.calibration, writer(self.to).write, 1e-6
-        numbers, names = np.asarray(flatten(calibration.imu), float), names_of(calibration.imu)
+        numbers = np.asarray(flatten(calibration.imu), float)
+        names = names_of(calibration.imu)
         free = [name for name in calibration.names if name.effect is None and name.owner in self.unit.triads]
 
         def values(row: int, step: float) -> FloatArray:

@@ -46,7 +46,8 @@ def write(parameters: ExportedUnit) -> Written:
     equation = f"f = inverse(M) (y - b)\nM = {matrix_text(accel)}\nb = {accel_bias}"
     if "gyroscope" in parameters.triads:
         gyro, rotation, sensitivity = view["gyro_matrix"], view["gyro_rotation"], view["g_sensitivity"]
-        blocks, bias = {"M": gyro, "A": sensitivity, "C_gyro_i": rotation}, vector_text(view["gyro_bias"])
+        blocks = {"M": gyro, "A": sensitivity, "C_gyro_i": rotation}
+        bias = vector_text(view["gyro_bias"])
         lines += ["  gyroscopes:", *yaml_matrices(blocks, 4, 4), f"    bias: {bias}"]
         corrections["gyroscope"] = Correction(
             rotation.T @ np.linalg.inv(gyro), view["gyro_bias"], sensitivity @ rotation, frame

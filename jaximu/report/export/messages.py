@@ -62,12 +62,14 @@ def write_messages(calibration: Calibration, raw: Recording, corrected: Recordin
             f"{os.fspath(path)}: messages of ROS need the package rosbags: pip install 'jaximu[formats]'."
         ) from None
     types = get_typestore(Stores.ROS2_HUMBLE)
-    target, one_file = Path(path), bool(Path(path).suffix)
+    target = Path(path)
+    one_file = bool(Path(path).suffix)
     if not one_file and target.exists():
         raise InputError(f"{target} exists: name a new folder for the bag, or a file NAME.mcap.")
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}")
     streams = [*_streams("/imu/raw", raw), *_streams("/imu/corrected", corrected), *_residual(calibration, corrected)]
-    start, first = round(Fraction(raw.start) * 10**9), round(1e9 * min(float(stream.time[0]) for stream in streams))
+    start = round(Fraction(raw.start) * 10**9)
+    first = round(1e9 * min(float(stream.time[0]) for stream in streams))
     start = max(start, -first)  # stamps of ROS are not negative
     first += start
     try:
@@ -105,7 +107,8 @@ def _streams(topic: str, recording: Recording) -> Iterator[_Stream]:
     else:
         for name, signal in held:
             yield _imu(topic if len(held) == 1 else f"{topic}/{name}", {name: signal})
-    field, temperature = recording.magnetometer, recording.temperature
+    field = recording.magnetometer
+    temperature = recording.temperature
     if field is not None and field.unit == "uT":
         numbers = np.hstack([_TESLA * field.values, np.zeros((len(field), 9))])
         yield _Stream(f"{topic}/field", "sensor_msgs/msg/MagneticField", field.time, numbers)
@@ -139,7 +142,8 @@ def _messages(stream: _Stream, types: Any, start: int) -> Iterator[tuple[int, st
     example = bytes(types.serialize_cdr(_example(stream, types), stream.kind))
     stamps = start + np.round(1e9 * stream.time).astype(np.int64)
     for first in range(0, len(stamps), _BLOCK):
-        some, numbers = stamps[first : first + _BLOCK], stream.numbers[first : first + _BLOCK]
+        some = stamps[first : first + _BLOCK]
+        numbers = stream.numbers[first : first + _BLOCK]
         rows = np.tile(np.frombuffer(example, np.uint8), (len(some), 1))
         rows[:, len(example) - size :] = np.ascontiguousarray(numbers, "<f8").view(np.uint8)
         if stream.kind != "std_msgs/msg/Float64":  # it has no header
@@ -152,7 +156,8 @@ def _example(stream: _Stream, types: Any) -> Any:
     known = types.types
     header = _header(types, 0)
     zero = known["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-    make, none = known[stream.kind], np.zeros(9)
+    make = known[stream.kind]
+    none = np.zeros(9)
     match stream.kind.rpartition("/")[2]:
         case "Imu":
             return make(header, known["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0), none, zero, none, zero, none)
@@ -172,7 +177,6 @@ def _header(types: Any, stamp: int) -> Any:
 
 
 def _status(calibration: Calibration, types: Any, stamp: int) -> bytes:
-    """Return the message that says which calibration it is, and the verdict of its diagnosis if there was one."""
     known = types.types
     verdict = str((calibration.diagnosis or {}).get("verdict", "not diagnosed"))
     level = 0 if verdict in ("adequate", "effects") else 1

@@ -180,7 +180,8 @@ def noise_files(
     **Arguments:** `densities` as for [`noise_values`], and for GTSAM "integration_covariance" (m²/s); `rate`: of the
     samples, Hz; `comments`: lines for the head; `gravity`: m/s², for tools that ask for it beside the noise.
     """
-    made, values = TARGETS[name], noise_values(name, densities, rate)
+    made = TARGETS[name]
+    values = noise_values(name, densities, rate)
     head = [f"{made.tool}: {made.kind}.", *comments]
     if name == "gtsam":
         return _gtsam(values, made, densities.get(INTEGRATION), head, gravity)

@@ -23,10 +23,9 @@ def write(parameters: ExportedUnit) -> Written:
     arrays |= {"covariance": calibration.covariance, "parameters": np.array(calibration.names)}
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # pyright: ignore[reportArgumentType]
-    convention = "forward: y = gain u + bias, so u = inverse_gain (y - bias); covariance in the order of parameters."
     return Written(
         {"": buffer.getvalue()},
-        convention,
+        "forward: y = gain u + bias, so u = inverse_gain (y - bias); covariance in the order of parameters.",
         parameters.equation("inverse_gain"),
         parameters.corrections(),
         uncertainty=True,

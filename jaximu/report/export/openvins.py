@@ -31,8 +31,10 @@ def write(parameters: ExportedUnit) -> Written:
     """Write the intrinsics in OpenVINS's "kalibr" model; its loader needs every key, so an identity stays written."""
     parameters.require_si("OpenVINS")
     view = parameters.kalibr()
-    frame, rotation = view["body_rotation"], view["gyro_rotation"]
-    sensitivity, zero = view["g_sensitivity"] @ rotation, np.zeros(3)
+    frame = view["body_rotation"]
+    rotation = view["gyro_rotation"]
+    sensitivity = view["g_sensitivity"] @ rotation
+    zero = np.zeros(3)
     blocks = {
         "Tw": view["gyro_matrix"],
         "R_IMUtoGYRO": rotation,

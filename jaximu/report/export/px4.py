@@ -65,7 +65,8 @@ class PX4(Firmware):
 
     def thermal(self, file: ParameterFile, triad: str, number: int, celsius: float | None) -> FloatArray:
         """X0 + X1 d + X2 d² + X3 d³, d = T − TREF."""
-        letter, identity = _SENSORS[triad][0], self.identities(file, triad)[number]
+        letter = _SENSORS[triad][0]
+        identity = self.identities(file, triad)[number]
         stems = (f"TC_{letter}{at}_" for at in range(self.sensors))
         stem = next((stem for stem in stems if file.value(f"{stem}ID", 0.0) == identity), None)
         if stem is None or file.value(f"TC_{letter}_ENABLE", 0.0) != 1:

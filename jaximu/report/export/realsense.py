@@ -20,15 +20,18 @@ SUMMARY = "RealSense: motion intrinsics (calibration.json of rs-imu-calibration)
 def write(parameters: ExportedUnit) -> Written:
     """Write both triads; the identity for a gyroscope that was not calibrated."""
     parameters.require_si("RealSense")
-    entry, equation = {}, []
+    entry = {}
+    equation = []
     for name in ("accelerometer", "gyroscope"):
         triad = parameters.triads.get(name)
         matrix, bias = (np.eye(3), np.zeros(3)) if triad is None else (triad.inverse, triad.inverse @ triad.bias)
         entry[name] = {"scale_and_alignment": matrix.T.ravel().tolist(), "bias": bias.tolist()}
         equation.append(f"{name}: u = M y - b\nM = {matrix_text(matrix)}\nb = {vector_text(bias)}")
     text = json.dumps({"device_type": "D435i", "imus": [entry]}, indent=4, sort_keys=True)
-    convention = (
+    return Written(
+        {"": (text + "\n").encode()},
         "inverse: u = M y - b, the bias subtracted after M and in SI units; scale_and_alignment holds M column by "
-        "column. The camera itself keeps single precision: 6e-8 of a value. Log with enable_motion_correction off."
+        "column. The camera itself keeps single precision: 6e-8 of a value. Log with enable_motion_correction off.",
+        "\n".join(equation),
+        parameters.corrections(),
     )
-    return Written({"": (text + "\n").encode()}, convention, "\n".join(equation), parameters.corrections())

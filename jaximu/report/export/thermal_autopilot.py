@@ -154,13 +154,16 @@ class _Targets:
         """
         celsius = np.linspace(self.low, self.high, _POINTS)
         values = model = steady_change(self.calibration, name, celsius)
-        counted, weight = slice(None), np.ones(_POINTS)
+        counted = slice(None)
+        weight = np.ones(_POINTS)
         if self.working is not None:
-            blocks, fit = self.working.blocks, self.working.fits[name]
+            blocks = self.working.blocks
+            fit = self.working.fits[name]
             corrected = [bool(terms) for terms in fit.candidate.model]
             data = np.where(corrected, blocks.means[name] - fit.level.T[blocks.level], 0.0)
             celsius = np.concatenate([np.clip(blocks.temperature, self.low, self.high), celsius])
-            values, model = np.concatenate([data, values]), np.concatenate([fit.fitted, model])
+            values = np.concatenate([data, values])
+            model = np.concatenate([fit.fitted, model])
             counted = slice(len(blocks))
             weight = np.concatenate([np.ones(len(blocks)), weight * _STEADY * len(blocks) / _POINTS])
         size = np.abs(celsius - about).max()

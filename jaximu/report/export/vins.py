@@ -34,8 +34,10 @@ def write(parameters: ExportedUnit) -> Written:
         f"{key.name} = {key.density} sqrt({key.factor**2 * rate:.6g} Hz) = {numbers[key.name]:.6g}"
         for key in TARGETS["vins"].keys
     )
-    convention = (
+    return Written(
+        {"": content},
         "noise per sample at the recording's rate, not densities; in motion they must be larger, and `jaximu "
-        "consequences --noise-for vins` states by how much. Scale, misalignment and bias have no place in the file."
+        "consequences --noise-for vins` states by how much. Scale, misalignment and bias have no place in the file.",
+        equation,
+        {},
     )
-    return Written({"": content}, convention, equation, {})
