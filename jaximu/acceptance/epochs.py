@@ -209,13 +209,13 @@ def require_apart(calibrations: Sequence[Calibration], files: Sequence[str]) -> 
     """Raise `InputError` for a calibration given twice, `NotPossibleError` where two rest on one recording."""
     hashes = {}
     for calibration, file in zip(calibrations, files, strict=True):
-        for recording in calibration.data.get("files", ()):
-            sha256 = recording.get("sha256")
-            if sha256 and sha256 in hashes:
+        recordings = {part["sha256"]: part for part in calibration.data.get("files", ()) if part.get("sha256")}
+        for sha256, recording in recordings.items():
+            if sha256 in hashes:
                 raise NotPossibleError(
                     f"{hashes[sha256]} and {file} rest on the same recording, {recording['file']}: their errors are "
                     "not independent, so a difference shows nothing of the unit. Calibrate each recording once."
                 )
-        hashes |= {r["sha256"]: file for r in calibration.data.get("files", ()) if r.get("sha256")}
+        hashes |= dict.fromkeys(recordings, file)
         if sum(calibration == other for other in calibrations) > 1:
             raise InputError(f"{file} is given twice: name different calibrations of the unit.")

@@ -229,7 +229,6 @@ def _meaning(key: str, where: str) -> tuple[str, str, tuple[int, ...], str]:
 
 
 def _value(stated: Any, base: str, where: str) -> float:
-    """Return a number in the unit `base` from one with its unit."""
     examples = {"1": "1 %", "rad": "10 mrad", "rad/s": "0.5 deg/s", "m/s^2": "20 mg", "deg": "0.5 deg"}
     number, text = _split(stated, where, f', such as "{examples.get(base, f"1 {base}")}"')
     if text.replace(" ", "") == base.replace(" ", ""):

@@ -320,14 +320,14 @@ def population_limits(path: FilePath, rule: Rule) -> Limits:
         values = measured.value[kept, index]
         stem, _, axes = name.rstrip("]").partition("[")
         owner, _, part = stem.partition(".")
-        middle, half = float(np.mean(values)), factor * float(np.std(values, ddof=1))
+        middle = float(np.mean(values))
+        half = factor * float(np.std(values, ddof=1))
         axis = tuple(map(int, axes.split(",")))
         limits.append(Limit(name, owner, part, axis, middle - half, middle + half, si_unit(name), source))
     return Limits(tuple(limits), rule, nominal, table.file, file_digest(path))
 
 
 def _in_counts(table: Batch, nominal: Scales) -> dict:
-    """Return the nominal scales of the triads that were logged in counts."""
     triads = table.units.like.triads()
     return {owner: scales for owner, scales in nominal.items() if triads[owner].output_unit == "count"}
 

@@ -87,7 +87,8 @@ def of_calibration(calibration: Calibration) -> Units:
     data = calibration.data
     excess = calibration.excess
     numbers = {owner: sum(name.owner == owner for name in names) for owner in SENSOR_QUANTITIES}
-    poses, turns = data.get("poses"), data.get("turns")
+    poses = data.get("poses")
+    turns = data.get("turns")
     counts = {}
     if poses is not None:
         # by hand a pose tells the norm alone; a known pose tells all three axes

@@ -323,7 +323,8 @@ def read_fleet(table: FilePath) -> Fleet:
                     alike = reasons.setdefault(re.sub(r"\d+", "0", reason), reason)
                     failed.setdefault(alike, []).append(row["file"])
     gyroscope = kinds[True] >= kinds[False]
-    total, others = kinds[gyroscope], kinds[not gyroscope]
+    total = kinds[gyroscope]
+    others = kinds[not gyroscope]
     notes = []
     if others:
         notes.append(f"{others} units {'without' if gyroscope else 'with'} a gyroscope are not part of the population.")

@@ -184,7 +184,8 @@ def _unit(
 
 
 def _facts(recording: Recording, unit: FleetUnit, notes: Sequence[str]) -> Json:
-    poses, turns = unit.observations.poses, unit.observations.turns
+    poses = unit.observations.poses
+    turns = unit.observations.turns
     row: Json = {
         "poses": int(np.sum(poses.mask)),
         "turns": int(np.sum(turns.mask)) if unit.gyroscope else None,
@@ -288,7 +289,6 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> Js
 
 
 def _require(fit: Fit, poses: int, where: str, sensor: str) -> None:
-    """Raise `NotPossibleError` for what is no calibration."""
     if not fit.finite:
         raise NotPossibleError(f"{where}: {Failure.NONFINITE.value}.")
     require_spanning(fit.covariance / fit.sizes[:, None] / fit.sizes, fit.names, poses, where, sensor)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -11,12 +10,8 @@ from pathlib import Path
 from jaximu.fleets.engines import ENGINES
 from jaximu.fleets.jobs import Job, Settings
 from jaximu.fleets.store import Store
+from jaximu.ground.cores import available_cores
 from jaximu.ground.errors import FilePath, InputError
-
-
-def available_cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def run_fleet(

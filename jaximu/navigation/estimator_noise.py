@@ -90,7 +90,6 @@ class Stretches(NamedTuple):
 
 
 def _spread(rows: IntArray) -> IntArray:
-    """Return at most `_MOST` rows, evenly spread."""
     return rows if len(rows) <= _MOST else rows[np.linspace(0, len(rows) - 1, _MOST).astype(int)]
 
 
@@ -589,7 +588,8 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
 
 
 def _measured_part(stretches: Stretches, spread: dict[tuple[str, str], FloatArray], block: IntArray) -> _Length:
-    errors, velocity_errors = stretches.errors, stretches.velocity_errors
+    errors = stretches.errors
+    velocity_errors = stretches.velocity_errors
     assert errors is not None
     moments = {"gyroscope": errors[:, :3], "accelerometer": velocity_errors}
     squares = {name: None if error is None else _squared(error[..., None]) for name, error in moments.items()}
@@ -630,7 +630,6 @@ def _multiples(unit: FloatArray, moment: FloatArray) -> float:
 
 
 def _terms(part: _Length, triad: str) -> dict[str, float]:
-    """Return what a triad's error is made of, each as a multiple of its white noise."""
     white = part.noise[triad, "white"][:, _OWN[triad], _OWN[triad]]
     return {name: float(np.sqrt(_multiples(white, moment))) for name, moment in part.terms[triad].items()}
 
@@ -646,7 +645,8 @@ def _multiplier(
     moment = part.moment[triad]
     if moment is None:
         return None
-    white, known = part.noise[triad, "white"][:, rows, rows], walks[triad] ** 2 * part.noise[triad, "1"][:, rows, rows]
+    white = part.noise[triad, "white"][:, rows, rows]
+    known = walks[triad] ** 2 * part.noise[triad, "1"][:, rows, rows]
     candidates = [_with_interval(white, known, moment, part.roots[triad], part.block, draws, rng)]
     if triad == "accelerometer":
         beside = turned**2 * part.noise["gyroscope", "white"] + walks["gyroscope"] ** 2 * part.noise["gyroscope", "1"]

@@ -181,7 +181,6 @@ def mechanise(
 
 
 def _scanned(advance: Callable, start: Navigation, lanes: tuple, parts: tuple) -> Navigation:
-    """Return the states after each of the parts, lanes first."""
     first = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, lanes), _split(start))
     states = jax.lax.scan(advance, first, parts)[1]
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, len(lanes)), _joined(states))

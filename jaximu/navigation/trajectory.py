@@ -227,7 +227,8 @@ def of_recording(recording: Recording, calibration: Calibration, site: Place, du
     if recording.gyroscope is None:
         raise NotPossibleError(f"{recording.name} has no gyroscope: record a motion with both sensors.")
     ready = compensate(calibration, recording)
-    gyroscope, accelerometer = ready.gyroscope, ready.accelerometer
+    gyroscope = ready.gyroscope
+    accelerometer = ready.accelerometer
     assert gyroscope is not None
     time = gyroscope.time
     rate = gyroscope.values

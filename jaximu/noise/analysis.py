@@ -234,7 +234,6 @@ def evenly_sampled(signal: Signal, what: str = "the signal") -> tuple[FloatArray
 
 
 def _taken_out(name: str, axes: Sequence[Identified]) -> list[str]:
-    """Say what was found beside the noise and taken out of it before the analysis."""
     unit = SI_UNITS[SENSOR_QUANTITIES[name]]["B"]
     notes = []
     spikes = [f"{axis} ({it.outliers})" for axis, it in zip("xyz", axes, strict=True) if it.outliers]

@@ -44,14 +44,15 @@ def _of_ready(ready: Prepared) -> NoiseModel:
         values = np.stack([filled(axis, BRIDGED) for axis in values])
         first, last = max(runs_of(np.asarray(np.isfinite(values).all(axis=0))), key=np.ptp)
         whole = values[:, first:last]
-        if whole.shape[1] < values.shape[1]:
+        samples = last - first
+        if samples < values.shape[1]:
             notes.append(
-                f"{what} has gaps: its noise is that of the longest part without, {whole.shape[1] / rate:.0f} of "
+                f"{what} has gaps: its noise is that of the longest part without, {samples / rate:.0f} of "
                 f"{values.shape[1] / rate:.0f} s."
             )
-        if whole.shape[1] < _FEWEST:
+        if samples < _FEWEST:
             raise NotPossibleError(
-                f"{what} has {whole.shape[1]} samples at rest without a gap, too few to model its noise: record "
+                f"{what} has {samples} samples at rest without a gap, too few to model its noise: record "
                 "the unit at rest for half an hour or more."
             )
         if not (np.ptp(whole, axis=1) > 0).all():

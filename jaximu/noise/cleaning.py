@@ -84,7 +84,8 @@ def filled(values: FloatArray, longest: int | None = None) -> FloatArray:
         before, after = before[~np.isnan(before)], after[~np.isnan(after)]
         if not len(before) or not len(after):
             continue
-        level, level_after = before.mean(), after.mean()
+        level = before.mean()
+        level_after = after.mean()
         scatter = np.resize(before[::-1] - level, size)
         values[first:last] = level + (level_after - level) * np.arange(1, size + 1) / (size + 1) + scatter
     return values
@@ -106,7 +107,8 @@ def periodic_lines(
     periodic = None
     rest, _ = without_line(values)
     for _ in range(4):
-        peaks, news = _peaks(rest, None if highest is None else round(highest / rate * samples)), False
+        peaks = _peaks(rest, None if highest is None else round(highest / rate * samples))
+        news = False
         for low, peak, high in peaks:
             touching = [i for i, (a, b) in enumerate(spans) if low <= b + 6 and high >= a - 6]
             if touching:  # what subtraction left of a line that is not quite steady
@@ -201,10 +203,10 @@ def lowest(function: Callable[[float], float], bounds: tuple[float, float], tole
 
 
 def _wave(values: FloatArray, peak: int, rate: float) -> tuple[PeriodicLine, FloatArray]:
-    """Return the line near ordinate `peak`, and its samples."""
     samples = len(values)
     index = np.arange(samples)
-    turn = np.exp(-2j * np.pi * peak / samples * index)
+    circle = -2j * np.pi
+    turn = np.exp(circle * peak / samples * index)
     taper = 0.5 - 0.5 * np.cos(2 * np.pi * (index + 0.5) / samples)
     size = max(1, samples // 4096)
     blocks = samples // size
@@ -212,7 +214,7 @@ def _wave(values: FloatArray, peak: int, rate: float) -> tuple[PeriodicLine, Flo
     middle = (np.arange(blocks) * size + (size - 1) / 2) / samples
 
     # where the line is highest
-    shift = lowest(lambda at: -np.abs(np.sum(coarse * np.exp(-2j * np.pi * at * middle))), (-1.0, 1.0), 1e-7)
-    turn = turn * np.exp(-2j * np.pi * shift / samples * index)
+    shift = lowest(lambda at: -np.abs(np.sum(coarse * np.exp(circle * at * middle))), (-1.0, 1.0), 1e-7)
+    turn *= np.exp(circle * shift / samples * index)
     phasor = 2 * np.sum(values * turn * taper) / np.sum(taper)
     return PeriodicLine((peak + shift) * rate / samples, float(np.abs(phasor))), np.asarray((phasor * turn.conj()).real)

@@ -7,7 +7,6 @@ combined algorithm of C. A. Greenhall and W. J. Riley, Uncertainty of stability 
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaximu.ground.array_types import FloatArray, IntArray
+from jaximu.ground.cores import available_cores
 from jaximu.ground.distributions import deviation_interval
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -159,7 +159,7 @@ def deviation(
         alpha = _exponents(points, grid.factor) if exponent is None else np.full(len(grid.factor), exponent)
         return *_mean_squares(points, lost, grid, difference), alpha
 
-    with ThreadPoolExecutor(_processors()) as pool:
+    with ThreadPoolExecutor(available_cores()) as pool:
         square, count, alpha = map(np.array, zip(*pool.map(analysed, rows), strict=True))
     if (count < 2).any():
         row, column = np.argwhere(count < 2)[0]
@@ -204,10 +204,6 @@ def _require_sense(data: FloatArray, rate: float, difference: _DeviationKind, ph
         raise InputError(f"{what} and cannot be taken over gaps (NaN).")
 
 
-def _processors() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 @dataclass(frozen=True)
 class _Grid:
     """For each averaging time (T,): `count` differences of points `lag` apart, from point `first` on.
@@ -242,7 +238,6 @@ def _grid(factors: IntArray, samples: int, kind: _DeviationKind, multi: bool) ->
 
 
 def _full_count(samples: int, factors: IntArray, kind: _DeviationKind) -> IntArray:
-    """Differences there are without gaps."""
     if kind.total:
         return np.full(len(factors), samples - 1)
     free = samples + 1 + kind.modified - (kind.order + kind.modified) * factors

@@ -325,7 +325,6 @@ def _bins(samples: int) -> tuple[IntArray, FloatArray, IntArray]:
 
 
 def _spectrum(values: FloatArray, rate: float, bands: Sequence[tuple[float, float]]) -> _Spectrum:
-    """Transform the samples, leaving out bands of frequency (Hz)."""
     rest, slope = without_line(values)
     coefficient = np.asarray(scipy.fft.dct(rest, norm="ortho"), np.float64) / np.sqrt(rate)
     return _binned(coefficient, rate, slope * rate, bands)
@@ -521,8 +520,9 @@ class _Model:
 
         shares, sizes, ratio, loss = evaluate(theta)
         for _ in range(80):
-            slope = 0.5 * shares[:, free].T @ (self.weight * (ratio - 1))
-            fisher = 0.5 * shares[:, free].T @ (self.weight[:, None] * shares[:, free])
+            moving = shares[:, free]
+            slope = 0.5 * moving.T @ (self.weight * (ratio - 1))
+            fisher = 0.5 * moving.T @ (self.weight[:, None] * moving)
             diagonal = np.diag(fisher)
             live = diagonal > 1e-4  # what has vanished stays so
             if not live.any():
@@ -734,7 +734,6 @@ def _high_pass(general: _Fit, threshold: float) -> Term | None:
 
 
 def _around_least(grid: FloatArray, losses: Sequence[float]) -> tuple[float, float]:
-    """Return the points of a grid on either side of the least loss."""
     best = int(np.argmin(losses))
     return grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
 

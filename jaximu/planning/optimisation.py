@@ -178,7 +178,8 @@ def _limited(question: DesignQuestion, design: Design, step: Step) -> tuple[Floa
 
 def _descend(question: DesignQuestion, design: Design, fastest: float, iterations: int) -> tuple[float, Design]:
     """Minimise from one start, in the chart about it."""
-    poses, turns = len(design.attitude), len(design.rate)
+    poses = len(design.attitude)
+    turns = len(design.rate)
     ends = 3 * poses, 3 * (poses + turns)
 
     def step(vector: np.ndarray) -> Step:

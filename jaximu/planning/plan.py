@@ -145,7 +145,8 @@ class Known:
         observations = calibration.observations
         if observations is None:
             return replace(known, excess=_left_over(calibration))
-        poses, turns = observations.poses, observations.turns
+        poses = observations.poses
+        turns = observations.turns
         poses = part_of(poses, np.asarray(poses.mask))
         noise = np.asarray(turns.noise)
         turned = np.asarray(turns.interval)[np.asarray(turns.mask)]
@@ -185,7 +186,8 @@ def _left_over(calibration: Calibration) -> tuple[float, float, float]:
     Its rms, in SI, is all that a file tells; the conditions that the parameters took up are made up for.
     """
     left = {name: after for name, (_, after, _) in calibration.rms.items()}
-    poses, turns = calibration.data.get("poses", 0), calibration.data.get("turns", 0)
+    poses = calibration.data.get("poses", 0)
+    turns = calibration.data.get("turns", 0)
     scale = {name: float(np.trace(triad.gain @ triad.gain.T)) for name, triad in calibration.triads().items()}
     rotation = scale.get("gyroscope", 0.0)
     if "specific_force" in left:  # with equipment: vectors of three components, twelve parameters a triad

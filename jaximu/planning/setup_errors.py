@@ -169,7 +169,6 @@ def quantity(value: Any, unit: str, where: str) -> float:
 
 
 def _errors(table: Any, name: str, environment: Mapping[str, Any]) -> Json:
-    """Check the table; sizes in SI, with the text they were stated in."""
     sizes_of = {}
     latitude = "latitude" in environment
     for key, value in only(table, _ERRORS, name, "[errors]").items():
@@ -321,17 +320,18 @@ def _stops(intervals: tuple[ScheduleEntry, ...], motion: Motion) -> _Stops:
 
 def _attitude_roots(stops: _Stops, kind: str) -> dict[str, FloatArray]:
     """How unit draws of each kind of error turn the unit at the stops: (3 A, k)."""
-    count = len(stops.up)
+    up = stops.up
+    count = len(up)
     settings = int(stops.setting.max()) + 1
     member = stops.setting[:, None] == np.arange(settings)  # (A, settings)
-    across = np.eye(3) - stops.up[:, :, None] * stops.up[:, None, :]
-    about = np.eye(count)[:, None, :] * stops.up[:, :, None]  # (A, 3, A)
+    across = np.eye(3) - up[:, :, None] * up[:, None, :]
+    about = np.eye(count)[:, None, :] * up[:, :, None]  # (A, 3, A)
     others = np.einsum("aij,as->aisj", across, member).reshape(count, 3, -1)
     mounted = np.ones((count, 1)) if kind == "dividing-head" else member  # one mounting
     mounting = np.einsum("as,ij->aisj", mounted, np.eye(3)).reshape(count, 3, -1)
-    polar = np.arccos(np.clip(stops.up[:, 2], -1, 1))
-    level = np.hypot(stops.up[:, 0], stops.up[:, 1]) < 1e-9
-    azimuth = np.where(level, 0.0, np.arctan2(stops.up[:, 1], stops.up[:, 0]))
+    polar = np.arccos(np.clip(up[:, 2], -1, 1))
+    level = np.hypot(up[:, 0], up[:, 1]) < 1e-9
+    azimuth = np.where(level, 0.0, np.arctan2(up[:, 1], up[:, 0]))
     turned = Rotation.from_euler("z", azimuth[:, None])
     tilting = turned.apply(np.stack([np.cos(polar), np.zeros(count), -np.sin(polar)], axis=1))
     roots = {

@@ -133,7 +133,8 @@ def _figure(array: Array) -> Figure:
 
 
 def _draw(panel, unit: ArrayUnit, across: int, up: int, length: float, named: bool) -> None:
-    centre, width = 1e3 * unit.position, 1.96e3 * unit.position_sigma
+    centre = 1e3 * unit.position
+    width = 1.96e3 * unit.position_sigma
     panel.errorbar(centre[across], centre[up], width[up], width[across], color="0.45", linewidth=1.0, zorder=1)
     axes = scipy.spatial.transform.Rotation.from_quat(unit.rotation, scalar_first=True).as_matrix()
     for row, (name, color) in enumerate(AXES.items()):

@@ -4,23 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaximu.calibration import Calibration
+from jaximu.data.attitude import AgainstAttitude
 from jaximu.ground.page import Page, Picture, Statement
 from jaximu.ground.quantities import Z95, sentence, unit_text
 from jaximu.model.mounting import Mounting
 from jaximu.report.calibration import calibration_page
+from jaximu.report.canvas import Figure
 from jaximu.report.figures import AFTER, BEFORE, dressed, legend, stacked, zero_line
 from jaximu.report.words import gravity_statements, limits
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jaximu.data.attitude import AgainstAttitude
-
 
 _PANELS = {
     "rotation": "Rate off the reference's, mean of each interval",

@@ -105,7 +105,6 @@ def _first(attribution: Attribution) -> Iterator[Part]:
 
 
 def _look_alikes(attribution: Attribution) -> Iterator[Statement]:
-    """Say what a board's effect looks like that the place would settle."""
     for finding in attribution.findings:
         alike = [] if finding.name not in CATALOGUE else list(CATALOGUE[finding.name].look_alikes)
         settled = [name for name in alike if CATALOGUE[name].scope == "session" and "attitude" in CATALOGUE[name].needs]
@@ -139,7 +138,6 @@ def _verdicts_table(attribution: Attribution) -> Table:
 
 
 def _short(diagnosis: dict) -> str:
-    """Return a verdict, or the effects in plain words."""
     names = [effect["name"] for effect in diagnosis["effects"]]
     words = ", ".join(CATALOGUE[name].english if name in CATALOGUE else name for name in names)
     return ": ".join(filter(None, (diagnosis["verdict"] if diagnosis["verdict"] != "effects" else "", words)))

@@ -41,13 +41,15 @@ def draw_unit(axes: Axes, rotation: FloatArray) -> None:
 
     half = np.array([0.62, 0.45, 0.2])
     for axis, (name, color) in enumerate(figures.AXES.items()):
-        other, third = (axis + 1) % 3, (axis + 2) % 3
+        other = (axis + 1) % 3
+        third = (axis + 2) % 3
+        direction = rotation[:, axis]
         for sign in (1.0, -1.0):
             corners = np.zeros((4, 3))
             corners[:, axis] = sign * half[axis]
             corners[:, other] = half[other] * np.array([1, -1, -1, 1])
             corners[:, third] = half[third] * np.array([1, 1, -1, -1])
-            _, depth = _view(rotation[:, axis] * sign)
+            _, depth = _view(direction * sign)
             if depth < 0:  # towards the viewer
                 flat, _ = _view(corners @ rotation.T)
                 face = {"facecolor": "#F6F6F6", "alpha": 0.9} if sign < 0 else {"facecolor": color, "alpha": 0.45}
@@ -55,8 +57,8 @@ def draw_unit(axes: Axes, rotation: FloatArray) -> None:
                 if sign < 0 and depth < -0.2:  # an arrow names the positive ends
                     x, y = flat.mean(axis=0)
                     axes.text(x, y, f"−{name}", color=color, ha="center", va="center", fontsize=10, zorder=3)
-        start, _ = _view(rotation[:, axis] * half[axis])
-        stop, depth = _view(rotation[:, axis] * 1.15)
+        start, _ = _view(direction * half[axis])
+        stop, depth = _view(direction * 1.15)
         behind = depth > 0
         axes.annotate(
             "",

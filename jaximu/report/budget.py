@@ -131,7 +131,6 @@ def _verdict(budget: Budget) -> Iterator[str]:
 
 
 def _number(budget: Budget) -> tuple[str, str]:
-    """Return the standard deviation that is farthest from its goal; without goals, the dominant source's mean share."""
     shown = {goal.worst: goal for goal in budget.goals if budget.determined[budget.names.index(goal.worst)]}
     if shown:
         goal = max(shown.values(), key=lambda goal: _total(budget, goal) / goal.size)
@@ -152,8 +151,8 @@ def _total(budget: Budget, goal: Goal) -> float:
 
 
 def _wanted(goal: Goal) -> str:
-    """Return a goal as it was stated, and in the unit of the page where that is another."""
-    stated, shown = _stated(goal.text), amount(goal.size, goal.unit)
+    stated = _stated(goal.text)
+    shown = amount(goal.size, goal.unit)
     same = re.sub(r"^[\d.]+", "", stated) == re.sub(r"^[\d.]+", "", shown)
     return stated if same else f"{stated} ({shown})"
 

@@ -204,7 +204,6 @@ def _parameters(calibration: Calibration) -> Iterator[Part]:
 
 
 def _biases_of_the_recording(calibration: Calibration) -> str:
-    """Say what the biases are good for, and how well their means over the recording are known."""
     means = []
     for name, sigma in calibration.bias_sigma_recording.items():
         if calibration.open_numbers.isdisjoint(f"{name}.bias[{axis}]" for axis in range(3)):

@@ -224,15 +224,16 @@ def _statements(consequences: Consequences) -> list[Statement]:
 
 def _budget_figure(consequences: Consequences) -> Figure:
     variances = {name: position(term) ** 2 for name, term in consequences.terms.items()}
+    times = consequences.times
     whole = np.maximum(np.sum(list(variances.values()), axis=0), 1e-300)
     visible = [name for name in _order(consequences) if (variances[name] / whole).max() >= LEAST_SHARE]
     drawn = visible[: len(PALETTE)]
     end = f"after {_end(consequences)}"
     figure, (above, below) = figures.stacked(2, 3.2, sharex=True)
     for name, color in zip(drawn, PALETTE, strict=False):
-        above.plot(consequences.times, np.sqrt(variances[name]), color=color, linewidth=1.4)
+        above.plot(times, np.sqrt(variances[name]), color=color, linewidth=1.4)
     above.plot(
-        consequences.times,
+        times,
         position(consequences.total),
         color="black",
         linewidth=2.4,
@@ -240,9 +241,7 @@ def _budget_figure(consequences: Consequences) -> Figure:
         label="everything",
     )
     if consequences.check is not None:
-        above.plot(
-            consequences.times, position(consequences.check.sigma**2), color="#8A8A8A", linewidth=1.2, label="draws"
-        )
+        above.plot(times, position(consequences.check.sigma**2), color="#8A8A8A", linewidth=1.2, label="draws")
     figures.logarithmic(above, "y")
     legend(above, where="lower right")
     dressed(
@@ -252,16 +251,14 @@ def _budget_figure(consequences: Consequences) -> Figure:
     )
     shares = [100 * variances[name] / whole for name in drawn]
     rest = np.maximum(100 - np.sum(shares, axis=0), 0.0) if shares else 100 + 0 * whole
-    below.stackplot(
-        consequences.times, *shares, rest, colors=[*PALETTE[: len(drawn)], OTHERS], labels=[*drawn, "others"]
-    )
+    below.stackplot(times, *shares, rest, colors=[*PALETTE[: len(drawn)], OTHERS], labels=[*drawn, "others"])
     dressed(
         below,
         "What it is made of",
         xlabel="time (s)",
         ylabel="share of the terms' squares (%)",
         ylim=(0, 100),
-        xlim=(consequences.times[0], consequences.times[-1]),
+        xlim=(times[0], times[-1]),
     )
     legend_below(figure, below, 3)
     return figure
@@ -278,7 +275,8 @@ def _tracks_figure(consequences: Consequences) -> Figure:
     east, north = 2.45 * np.sqrt(
         consequences.total[-1, :2]
     )  # of two components, 95 % lie within 2.45 standard deviations
-    angle, sigma = np.linspace(0, 2 * np.pi, 100), Z95 * np.sqrt(consequences.total[:, 2])
+    angle = np.linspace(0, 2 * np.pi, 100)
+    sigma = Z95 * np.sqrt(consequences.total[:, 2])
     plane.plot(east * np.cos(angle), north * np.sin(angle), color=figures.FLAGGED, linewidth=1.6)
     plane.set_aspect("equal", "datalim")
     for side in (-1, 1):

@@ -170,8 +170,7 @@ def _causes(diagnosis: Diagnosis) -> str:
     return "; ".join(texts)
 
 
-def gained(diagnosis: Diagnosis) -> str:
-    """Say what modelling the causes, or else the smooth curve, gains on data that was not fitted."""
+def _gained(diagnosis: Diagnosis) -> str:
     gain = diagnosis.gain
     learned = diagnosis.learned
     effects = [cause.effect for cause in diagnosis.named]
@@ -195,7 +194,6 @@ def gained(diagnosis: Diagnosis) -> str:
 
 
 def _number(diagnosis: Diagnosis) -> tuple[str, str]:
-    """Return an error on data not fitted, without and with the extension, or else that of the fit; and what it is."""
     gain, effects, subject = _extension(diagnosis)
     if gain is not None:
         kind = gain.best_kind(*effects)
@@ -234,7 +232,6 @@ def _next(diagnosis: Diagnosis) -> str:
 
 
 def _mistake(diagnosis: Diagnosis, finding: Finding) -> Statement:
-    """Return a mistake in the recording: what is wrong unless the verdict says so, where, and how to repair it."""
     texts = [] if finding in _standing(diagnosis)[:1] and diagnosis.verdict != "adequate" else [sentence(finding.text)]
     if finding.rows:
         texts.append(f"Row{'s' * (len(finding.rows) > 1)} {', '.join(map(str, finding.rows))}.")
@@ -256,7 +253,6 @@ def _effect_row(effect: Named | NoiseFinding) -> tuple[str, str, str, str]:
 
 
 def _lines_figure(diagnosis: Diagnosis) -> Figure:
-    """Draw the spectrum over time of the axes with lines that move, those that cross zero frequency first."""
     parts = diagnosis.calibration.segmentations
     lines = {}
     for one in diagnosis.lines:

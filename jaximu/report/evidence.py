@@ -42,7 +42,8 @@ def evidence(calibration: Calibration) -> PoseAndTurnErrors | None:
     fit, nominal, observations = calibration.fit, calibration.nominal, calibration.observations
     if fit is None or nominal is None or observations is None:
         return None
-    poses, turns = np.asarray(observations.poses.mask), np.asarray(observations.turns.mask)
+    poses = np.asarray(observations.poses.mask)
+    turns = np.asarray(observations.turns.mask)
     used = turns if "gyroscope" in calibration.triads() else np.zeros_like(turns)
     force_before, angle_before = forces_and_angles(nominal, observations)
     force, angle_after = forces_and_angles(fit.imu, observations)

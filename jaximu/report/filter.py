@@ -191,16 +191,17 @@ def _figure(calibration: Calibration, history: History) -> Figure:
         legend(panel, 3, "upper right")
         dressed(panel, title)
     used = history.freedom > 0
-    panels[-1].plot(
+    innovations = panels[-1]
+    innovations.plot(
         time[used],
         np.maximum((history.innovations / np.maximum(history.freedom, 1))[used], 1e-3),
         ".",
         color=AXES["x"],
         markersize=3,
     )
-    logarithmic(panels[-1], "y")
-    zero_line(panels[-1], 1.0)
-    dressed(panels[-1], "Squared innovations over their expectation", xlabel="time [s]")
+    logarithmic(innovations, "y")
+    zero_line(innovations, 1.0)
+    dressed(innovations, "Squared innovations over their expectation", xlabel="time [s]")
     for panel in panels:
         panel.fill_between(
             time, 0, 1, where=history.rest, color="0.93", transform=panel.get_xaxis_transform(), step="pre", zorder=-1

@@ -137,7 +137,6 @@ class LivePage:
         )
 
     def _kept(self, name: str, key: Hashable, make: Callable[[], Picture]) -> str:
-        """Return a picture as HTML, made again where its key is another."""
         kept, text = self._drawings.get(name, (None, ""))
         if kept != key:
             try:

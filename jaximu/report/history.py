@@ -48,7 +48,6 @@ def _drift(movement: Movement) -> str:
 
 
 def _duration(history: UnitHistory, time: float) -> str:
-    """Return a time ahead in years, or steps, and the date then."""
     due = history.due(time)
     return _time(time, history.per) + (f" ({due.isoformat()})" if due else "")
 
@@ -271,34 +270,33 @@ def _changes_figure(history: UnitHistory) -> Figure:
     return figure
 
 
-def _surest(history: UnitHistory) -> list[Movement]:
-    return sorted(history.movements, key=lambda movement: (not movement.tested, movement.p_value))[:_DRAWN]
-
-
-def _points(panel: Axes, movement: Movement, at: NDArray[Any]) -> tuple[float, str]:
-    """Draw a number's values with their intervals; return the factor to its unit, and the unit."""
-    shown, factor = in_shown_unit(movement.unit)
-    panel.errorbar(
-        at,
-        factor * np.array(movement.values),
-        factor * Z95 * np.array(movement.apart),
-        fmt="o",
-        color=figures.FLAGGED,
-        markersize=4,
-        zorder=3,
-    )
-    figures.dressed(panel, spoken(movement.name))
-    panel.set_ylabel(shown)
-    return factor, shown
+def _drawn(history: UnitHistory, at: NDArray[Any], across: str) -> tuple[Figure, list[tuple[Axes, Movement, float]]]:
+    """Draw the numbers whose change is surest, with their intervals; return panels, numbers, and factors to units."""
+    surest = sorted(history.movements, key=lambda movement: (not movement.tested, movement.p_value))[:_DRAWN]
+    figure, panels = figures.stacked(len(surest), sharex=True)
+    panels[-1].set_xlabel(across)
+    drawn = []
+    for panel, movement in zip(panels, surest, strict=True):
+        shown, factor = in_shown_unit(movement.unit)
+        panel.errorbar(
+            at,
+            factor * np.array(movement.values),
+            factor * Z95 * np.array(movement.apart),
+            fmt="o",
+            color=figures.FLAGGED,
+            markersize=4,
+            zorder=3,
+        )
+        figures.dressed(panel, spoken(movement.name), ylabel=shown)
+        drawn.append((panel, movement, factor))
+    return figure, drawn
 
 
 def _history_figure(history: UnitHistory) -> Figure:
-    movements = _surest(history)
-    figure, panels = figures.stacked(len(movements), sharex=True)
     dated = history.per == "year"
     at = np.array(history.dates, "datetime64[D]") if dated else history.times
-    for panel, movement in zip(panels, movements, strict=True):
-        factor, _ = _points(panel, movement, at)
+    figure, drawn = _drawn(history, at, "" if dated else "steps before the last")
+    for panel, movement, factor in drawn:
         line = movement.line
         ahead = np.linspace(history.times[0], 0.0, 100)
         shared = movement.sigmas[-1] ** 2 - movement.apart[-1] ** 2
@@ -307,14 +305,8 @@ def _history_figure(history: UnitHistory) -> Figure:
         level = line.level + line.slope * ahead
         days = (history.times[-1] - ahead) / np.ptp(history.times) * (at[-1] - at[0])
         figures.band(panel, at[-1] - days, factor * level, factor * half, figures.AFTER)
-    panels[-1].set_xlabel("" if dated else "steps before the last")
     return figure
 
 
 def _temperature_figure(history: UnitHistory) -> Figure:
-    movements = _surest(history)
-    figure, panels = figures.stacked(len(movements), sharex=True)
-    for panel, movement in zip(panels, movements, strict=True):
-        _points(panel, movement, np.array(history.temperatures, float))
-    panels[-1].set_xlabel("temperature [°C]")
-    return figure
+    return _drawn(history, np.array(history.temperatures, float), "temperature [°C]")[0]

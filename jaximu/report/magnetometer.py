@@ -4,24 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaximu.calibration import Calibration
+from jaximu.calibration import Calibration, Heading
 from jaximu.calibration.magnetometer import hard_iron
+from jaximu.data.field import MagneticField
 from jaximu.ground.document import Json
 from jaximu.ground.page import Page, Picture, Statement
 from jaximu.ground.quantities import Z95, number, sentence
 from jaximu.report.calibration import calibration_page
+from jaximu.report.canvas import Figure
 from jaximu.report.figures import dressed, hemispheres, legend, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jaximu.calibration import Heading
-    from jaximu.data.field import MagneticField
-
 
 _PAYS = 0.8
 """Share of what is uncertain of a heading that must be left for further directions to be worth a turn."""
@@ -30,7 +24,6 @@ _ENOUGH = 0.6
 
 
 def _lead(calibration: Calibration) -> tuple[str, str, str]:
-    """Say how good a heading becomes, or how much the field's strength still scatters: sentence, number and meaning."""
     facts = calibration.magnetic
     assert facts is not None
     spread = facts["norm_spread"]
@@ -60,7 +53,8 @@ def statements(calibration: Calibration) -> Iterator[Statement]:
     triad = calibration.imu.magnetometer
     assert facts is not None and triad is not None
     gain = np.asarray(triad.gain)
-    strength, dip = facts["field"]["strength"], facts["field"]["dip"]
+    strength = facts["field"]["strength"]
+    dip = facts["field"]["dip"]
     # a field's image is an ellipsoid; how far from round it is, is soft iron and scale
     axes = np.linalg.svd(gain, compute_uv=False)
     iron, sigma = hard_iron(calibration)

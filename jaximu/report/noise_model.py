@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from jaximu.ground.page import Page, Table
 from jaximu.ground.quantities import number, readable, size
 from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_UNITS
-
-if TYPE_CHECKING:
-    from jaximu.model.noise_model import NoiseModel
+from jaximu.model.noise_model import NoiseModel
 
 
 def page_of(model: NoiseModel) -> Page:

@@ -144,7 +144,6 @@ def _poses(proposal: Proposal) -> Table:
 
 
 def _turns(proposal: Proposal) -> Iterator[Section]:
-    """Return the turns of a table; by hand, on a robot and in a sequence they stand beside the poses."""
     if proposal.turns and not proposal.equipment.chained:
         rows = [(str(index), turn.words) for index, turn in enumerate(proposal.turns, 1)]
         yield Section(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,14 +24,10 @@ from jaximu.ground.units import PREFIXES, SENSOR_UNITS
 from jaximu.mistakes.titles import effect_title
 from jaximu.planning.ramps import next_ramps
 from jaximu.recordings.recording import Recording, smoothed_slope
+from jaximu.report.canvas import Figure
+from jaximu.report.export.thermal_autopilot import AutopilotParameters
 from jaximu.report.figures import dressed, legend, new_figure, zero_line
 from jaximu.report.words import compensation, file_names, how_much_smaller
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jaximu.report.export.thermal_autopilot import AutopilotParameters
-
 
 _ROWS = 45  # three to a term of a regression
 _WORTH = 1.2  # times as large a share that a ramp must leave of some effect to be proposed
@@ -240,7 +236,7 @@ def _largest_change(calibration: Calibration, owner: str, plain: str) -> tuple[s
     rows = np.abs(value).argmax(axis=0), np.arange(3)
     factor, unit = readable(SENSOR_UNITS[owner], np.abs(value).max())
     cells = zip(factor * value[rows], factor * sigma[rows], strict=True)
-    return (*(with_interval(largest, spread) for largest, spread in cells), unit)
+    return *(with_interval(largest, spread) for largest, spread in cells), unit
 
 
 def _rest(thermal: ThermalCalibration) -> Iterator[Part]:
@@ -347,8 +343,7 @@ def loss_words(parameters: AutopilotParameters, thermal: ThermalCalibration) -> 
     parts = [
         f"{_size(name, left)} rms of the {name}'s output, the full model {_size(name, thermal.fits[name].after)}"
         for name, left in parameters.left.items()
-    ]
-    parts = parts or [
+    ] or [
         f"{_size(name, loss)} rms between them and the {name}'s full model at steady temperatures"
         for name, loss in parameters.loss.items()
     ]
@@ -461,18 +456,18 @@ def residual_figure(thermal: ThermalCalibration, name: str) -> Figure:
     figure = new_figure(6.0)
     parts = _both_ways(thermal)
     grid = figure.subplots(3, 2, sharey="row", sharex="col")
-    for axis in range(3):
-        for panel, x in zip(grid[axis], (blocks.temperature, blocks.time / 3600), strict=True):
+    for row, axis, values in zip(grid, "xyz", residual.T, strict=True):
+        for panel, x in zip(row, (blocks.temperature, blocks.time / 3600), strict=True):
             for part, style in parts:
-                panel.plot(x[part], residual[part, axis], ".", ms=3, **style)
+                panel.plot(x[part], values[part], ".", ms=3, **style)
             zero_line(panel)
             dressed(panel)
-        grid[axis][0].set_ylabel(f"{name} {'xyz'[axis]} [{unit}]", fontsize=9)
-    dressed(grid[0][0], "Residual bias by temperature")
-    dressed(grid[0][1], "by time")
-    legend(grid[0][0], 2)
-    grid[2][0].set_xlabel("temperature [°C]")
-    grid[2][1].set_xlabel("time [h]")
+        row[0].set_ylabel(f"{name} {axis} [{unit}]", fontsize=9)
+    dressed(grid[0, 0], "Residual bias by temperature")
+    dressed(grid[0, 1], "by time")
+    legend(grid[0, 0], 2)
+    grid[2, 0].set_xlabel("temperature [°C]")
+    grid[2, 1].set_xlabel("time [h]")
     return figure
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaximu.acceptance.epochs import over_temperature
 from jaximu.calibration import Calibration
 from jaximu.estimation.projection import OutputUncertainty
 from jaximu.ground.array_types import BoolArray, FloatArray
@@ -168,7 +169,7 @@ def _panels(calibration: Calibration, extent: Range) -> Iterator[tuple[str, str,
         both = np.radians(rates)[:, None, None] * _FACES
         half = _rate_known(calibration, extent, both.reshape(-1, 3)).reshape(-1, 2, 3)
         yield "Rate while turning", "rate (°/s)", "± 95 % (°/s)", {axis: rates for axis in "xyz"}, half.max(axis=1).T
-    warm = {name for name, triad in triads.items() if any("temperature" in effect.needs for effect in triad.effects)}
+    warm = over_temperature(calibration)
     low, high = calibration.data.get("temperature_range", extent.temperature)
     temperatures = np.linspace(low, high, _STEPS)
     stimulus = steady(np.tile(_FACES, (len(temperatures), 1)), extent.gravity, temperatures.repeat(len(_FACES)))
@@ -259,7 +260,7 @@ def sphere_figure(
     factor, unit = readable("m/s^2", float(finite.max()))
     best = factor * float(finite.min())
     worst = factor * float(finite.max())
-    span = (min(best, _LEAST_RANGE * worst), worst) if most is None else (0.0, factor * max(most, float(finite.max())))
+    span = (min(best, _LEAST_RANGE * worst), worst) if most is None else (0.0, max(factor * most, worst))
     half = factor * half
     levels = MaxNLocator(8, steps=[1, 2, 2.5, 5, 10]).tick_values(*span)
     colormap = LinearSegmentedColormap.from_list("", matplotlib.colormaps["YlGnBu"](np.linspace(0.0, 0.6, 64)))

@@ -189,7 +189,6 @@ def _errors(validity: Validity, experiment: Experiment) -> Figure:
 
 
 def _innovations(validity: Validity) -> Figure:
-    """Squared innovations of the filter in use over their expectation, update by update."""
     history = validity.history
     assert history is not None
     figure = figures.new_figure(3.0)

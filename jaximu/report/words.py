@@ -216,11 +216,13 @@ def limits(calibration: Calibration, errors: PoseAndTurnErrors | None = None) ->
         missing += ", the gyroscope's sensitivity to acceleration"
     else:
         yield Statement("Gyroscope", "It is not part of this calibration: the accelerometer alone was calibrated.")
-    text = f"Effects beyond scale, misalignment and bias were not tested ({missing})."
-    effects = [effect.title for triad in triads.values() for effect in triad.effects]
-    if effects:
-        text = f"Effects other than {', '.join(effects)} were not tested."
-    yield Statement("Not modelled", text)
+    effects = ", ".join(effect.title for triad in triads.values() for effect in triad.effects)
+    yield Statement(
+        "Not modelled",
+        f"Effects other than {effects} were not tested."
+        if effects
+        else f"Effects beyond scale, misalignment and bias were not tested ({missing}).",
+    )
 
 
 def direction_words(vector: np.ndarray) -> str:

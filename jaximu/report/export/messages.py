@@ -94,7 +94,6 @@ _STATUS = "diagnostic_msgs/msg/DiagnosticArray"
 
 
 def _streams(topic: str, recording: Recording) -> Iterator[_Stream]:
-    """Yield a recording's messages; sensors that share their stamps share a message."""
     held = []
     for name in ("accelerometer", "gyroscope"):
         signal = recording.signals.get(name)

@@ -73,7 +73,6 @@ class Target:
 def _keys(
     names: str, units: Sequence[str], white: float = 1.0, exponent: int = 1, power: float = 0.0
 ) -> tuple[Key, ...]:
-    """Keys for accelerometer and gyroscope noise and walk, in this order."""
     return tuple(
         Key(name, density, unit, white if density in (_ACCEL, _GYRO) else 1.0, exponent, power)
         for name, density, unit in zip(names.split(), _DENSITIES, units, strict=True)

@@ -43,7 +43,8 @@ def write(parameters: ExportedUnit) -> Written:
         "Tg": sensitivity,
     }
     # no key of the file holds a bias: the filter starts from these, if its launch file is told, or finds them itself
-    accel_bias, gyro_bias = vector_text(view["accel_bias"]), vector_text(view["gyro_bias"])
+    accel_bias = vector_text(view["accel_bias"])
+    gyro_bias = vector_text(view["gyro_bias"])
     biases = [f"  # accelerometer bias {accel_bias} m/s^2: OpenVINS estimates it, see init_dyn_bias_a"]
     corrections = {"accelerometer": Correction(np.linalg.inv(blocks["Ta"]), zero, frame=frame)}
     if "gyroscope" in parameters.triads:
