@@ -91,10 +91,10 @@ def in_own_axes(calibration: Calibration) -> tuple[Calibration, bool]:
         return jnp.stack([change.gain_accel, change.gain_gyro][: len(owners)])
 
     free = [Name(owner, "gain", axes) for owner in owners for axes in np.ndindex(3, 3)]
-    others = [name for name in calibration.names if name not in free]
-    slope = np.eye(len(free) + len(others))
-    slope[: len(free), : len(free)] = np.asarray(jax.jacfwd(turned)(gains)).reshape(len(free), len(free))
-    names = (*free, *others)
+    names = (*free, *(name for name in calibration.names if name not in free))
+    count = len(free)
+    slope = np.eye(len(names))
+    slope[:count, :count] = np.asarray(jax.jacfwd(turned)(gains)).reshape(count, count)
     covariance = slope @ calibration.covariance_of(names) @ slope.T
     fitted = {name.owner for name in calibration.names if name.part == "gain"}
     new = zip(owners, np.asarray(turned(gains)), strict=True)

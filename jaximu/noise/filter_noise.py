@@ -132,9 +132,7 @@ class FilterNumbers:
 
     def rows(self) -> list[tuple[str, str, str, float | None, str]]:
         """Return (key, formula, words, value, unit) of every number; value None where the data supports none."""
-        signal = SI_UNITS[self.quantity]["B"]
-        walk = SI_UNITS[self.quantity]["R"]
-        integral = SI_UNITS[self.quantity]["Q"]
+        signal, walk, integral = (SI_UNITS[self.quantity][term] for term in "BRQ")
         word = {"angular_rate": "angle", "specific_force": "velocity"}.get(self.quantity)
         squared = f"({signal})^2"
         return [

@@ -187,10 +187,12 @@ class Budget(Result, Document, page="budget"):
             entry: Json = {"name": name, "unit": unit, "determined": bool(self.determined[index])}
             if self.determined[index]:
                 ranked = sorted(order, key=lambda row: -self.sigma[row, index])
-                entry["sigma"] = float(total[index])
-                entry["contributions"] = {self.sources[row].name: float(self.sigma[row, index]) for row in ranked}
-                entry["nonlinear"] = {
-                    self.sources[row].name: float(self.actual[row, index]) for row, column in off if column == index
+                entry |= {
+                    "sigma": float(total[index]),
+                    "contributions": {self.sources[row].name: float(self.sigma[row, index]) for row in ranked},
+                    "nonlinear": {
+                        self.sources[row].name: float(self.actual[row, index]) for row, column in off if column == index
+                    },
                 }
                 if self.check is not None:
                     entry["monte_carlo"] = float(self.check.rms[index])

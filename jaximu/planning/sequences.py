@@ -148,7 +148,7 @@ class Filter:
         initial = self.begun()
         states = self.errors.states
         if not known:
-            free = [index for index, name in enumerate(self.names) if index not in self.earth]
+            free = [index for index in range(len(self.names)) if index not in self.earth]
             initial.root[states:, states:][free] = 0.0
         return run(initial, self._headed(rows, start.inv()))[0]
 

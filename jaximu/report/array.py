@@ -135,15 +135,16 @@ def _figure(array: Array) -> Figure:
 def _draw(panel, unit: ArrayUnit, across: int, up: int, length: float, named: bool) -> None:
     centre = 1e3 * unit.position
     width = 1.96e3 * unit.position_sigma
-    panel.errorbar(centre[across], centre[up], width[up], width[across], color="0.45", linewidth=1.0, zorder=1)
+    x, y = centre[[across, up]]
+    panel.errorbar(x, y, width[up], width[across], color="0.45", linewidth=1.0, zorder=1)
     axes = scipy.spatial.transform.Rotation.from_quat(unit.rotation, scalar_first=True).as_matrix()
     for row, (name, color) in enumerate(AXES.items()):
         tip = axes[row, [across, up]] * length
         panel.annotate(
             "",
-            (centre[across] + tip[0], centre[up] + tip[1]),
-            (centre[across], centre[up]),
+            (x + tip[0], y + tip[1]),
+            (x, y),
             arrowprops={"arrowstyle": "->", "color": color, "linewidth": 1.4},
         )
         if named and np.linalg.norm(tip) > 0.3 * length:
-            panel.text(centre[across] + 1.25 * tip[0], centre[up] + 1.25 * tip[1], name, color=color, ha="center")
+            panel.text(x + 1.25 * tip[0], y + 1.25 * tip[1], name, color=color, ha="center")

@@ -277,8 +277,8 @@ def residual_figure(errors: PoseAndTurnErrors) -> Figure:
         dressed(axes, f"Over a turn the gyroscope loses gravity's direction {lost}", ylabel="angle error (°)")
         legend(grid[1], 2)
     legend_below(figure, grid[-1], 4)
-    grid[-1].set_xlabel("pose" + (" (turns lie between two poses)" if rows == 3 else ""))
-    grid[-1].set_xlim(0.4, len(pose) + 0.6)
+    across = "pose" + (" (turns lie between two poses)" if rows == 3 else "")
+    grid[-1].set(xlabel=across, xlim=(0.4, len(pose) + 0.6))
     grid[-1].xaxis.get_major_locator().set_params(integer=True)
     return figure
 

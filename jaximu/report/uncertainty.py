@@ -200,8 +200,7 @@ def _curves_figure(panels: list) -> Figure:
                 linewidth=1.8,
                 label=f"about {name}" if name else None,
             )
-        figures.dressed(axes, title, xlabel=across, ylabel=up)
-        axes.set_ylim(0, None)
+        figures.dressed(axes, title, xlabel=across, ylabel=up, ylim=(0, None))
         if len(lines) > 1:
             figures.legend(axes, 3, "upper left")
     return figure

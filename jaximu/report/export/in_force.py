@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from jaximu.acceptance.epochs import over_temperature
 from jaximu.estimation.problem import flatten, names_of, unflatten
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import Json
@@ -186,7 +187,7 @@ class Composition:
                 "board's or the vehicle's: calibrate the autopilot's own log."
             )
         triad = calibration.triads()[name]
-        thermal = any("temperature" in effect.needs for effect in triad.effects)
+        thermal = name in over_temperature(calibration)
         celsius = triad.temperature_reference if thermal else calibration.data.get("temperature")
         return Logged(offset=-firmware.thermal(self.file, name, index, celsius))
 
