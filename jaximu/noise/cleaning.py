@@ -215,6 +215,6 @@ def _wave(values: FloatArray, peak: int, rate: float) -> tuple[PeriodicLine, Flo
 
     # where the line is highest
     shift = lowest(lambda at: -np.abs(np.sum(coarse * np.exp(circle * at * middle))), (-1.0, 1.0), 1e-7)
-    turn *= np.exp(circle * shift / samples * index)
+    turn = turn * np.exp(circle * shift / samples * index)
     phasor = 2 * np.sum(values * turn * taper) / np.sum(taper)
     return PeriodicLine((peak + shift) * rate / samples, float(np.abs(phasor))), np.asarray((phasor * turn.conj()).real)
