@@ -63,8 +63,10 @@ def statements(noise: EstimatorNoise) -> Iterator[Statement]:
 def _table(noise: EstimatorNoise) -> Table:
     rows = []
     for name, triad in noise.triads.items():
-        intervals = zip(triad.multiplier, triad.low, triad.high, strict=True)
-        texts = (f"{number(middle)} ({number(low)} to {number(high)})" for middle, low, high in intervals)
+        texts = [
+            f"{number(middle)} ({number(low)} to {number(high)})"
+            for middle, low, high in zip(triad.multiplier, triad.low, triad.high, strict=True)
+        ]
         rows.append((f"{name}, N times (95 %)", *texts))
         rows += [
             (f"– {term}", *(f"{value:.2f}" for value in values))
