@@ -333,7 +333,7 @@ def _uncertain_turns(unit: Imu, base: Calibration | None) -> FloatArray:
     """Return by what share (k, 3, 3) of itself the rate may be off, one standard deviation each, as calibrated or by a
     data sheet.
     """
-    if base is None or base.imu.gyroscope is None:
+    if base is None or "gyroscope" not in base.imu.triads():
         return _SHEET_GAIN * np.eye(9).reshape(9, 3, 3)
     known = base.of_numbers(lambda name: (name.owner, name.part) == ("gyroscope", "gain"))
     values, vectors = np.linalg.eigh(known.covariance)
@@ -359,18 +359,19 @@ def _wrong_turns(
     """
     used, changes = {name: getattr(windows, name) for name in ("used", "turn", "level")}, []
     for error in errors:
-        wrong = [None if motion is None else _turned(motion, error) for motion in motions]
+        wrong = [_turned(motion, error) for motion in motions]
         other = FieldWindows.joined(_windows(logs, wrong, windows.origin, windows.vertical))
         refitted = _fitted(fit.imu, replace(other, **used), field, full, np.asarray(fit.excess))
         changes.append(np.asarray(refitted.values) - np.asarray(fit.values))
     return np.array(changes)
 
 
-def _turned(motion: Recording, error: FloatArray) -> Recording:
-    """Return a recording whose angular rate is off by a share (3, 3) of itself."""
-    gyroscope = motion.gyroscope
-    assert gyroscope is not None
-    return replace(motion, gyroscope=replace(gyroscope, values=gyroscope.values @ (np.eye(3) + error).T))
+def _turned(motion: Recording | None, error: FloatArray) -> Recording | None:
+    """Return a recording whose angular rate, if it has one, is off by a share (3, 3) of itself."""
+    if motion is None or "gyroscope" not in motion.signals:
+        return motion
+    rate = motion.signals["gyroscope"]
+    return replace(motion, gyroscope=replace(rate, values=rate.values @ (np.eye(3) + error).T))
 
 
 def _windows(

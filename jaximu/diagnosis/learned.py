@@ -93,7 +93,7 @@ class LearnedTerm:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class PromisingCurve:
     """A curve that predicts what is left out better than a fit without it does; it is not fitted yet.
 
     state: that fit. effect: the dormant curve. spread (q,): what its coefficients are a priori. gain: on parts left
@@ -111,7 +111,7 @@ class Candidate:
         return (self.gain.otherwise or self.gain).after.log_likelihood
 
 
-def promising(experiment: Experiment, state: State) -> Candidate | None:
+def promising(experiment: Experiment, state: State) -> PromisingCurve | None:
     """Return the smooth curve of one covariate, on one triad, that predicts best what was left out; None if none pays.
 
     **Arguments:** `state`: a fit that leaves something unexplained.
@@ -124,7 +124,7 @@ def promising(experiment: Experiment, state: State) -> Candidate | None:
 
 
 def learn(
-    experiment: Experiment, candidate: Candidate, held: Experiment | None = None, level: float = LEVEL
+    experiment: Experiment, candidate: PromisingCurve, held: Experiment | None = None, level: float = LEVEL
 ) -> LearnedTerm | None:
     """Return a curve as it is fitted; None where it does not pay after all.
 
@@ -147,7 +147,7 @@ def learn(
     return LearnedTerm(curve_of(fitted), gain, *_curve(fitted), fitted, drift)
 
 
-def _best(experiment: Experiment, state: State, interleaved: bool) -> Candidate | None:
+def _best(experiment: Experiment, state: State, interleaved: bool) -> PromisingCurve | None:
     """Return the curve that predicts best what is left out.
 
     Where that is `interleaved`, only curves that belong to the recording are asked: all others are used beyond it.
@@ -173,7 +173,7 @@ def _best(experiment: Experiment, state: State, interleaved: bool) -> Candidate 
         return None
     effect, spread, columns, gained = best
     both = interleaved and parts[False].parts
-    return Candidate(state, effect, spread, replace(gained, otherwise=gain(columns, False) if both else None))
+    return PromisingCurve(state, effect, spread, replace(gained, otherwise=gain(columns, False) if both else None))
 
 
 def left_out_likelihood(experiment: Experiment, state: State) -> float:
@@ -285,7 +285,7 @@ class _Parts:
         return Prediction(self.experiment.real.rms(errors), squared / unit, count, likelihood)
 
 
-def _fitted(experiment: Experiment, candidate: Candidate) -> State:
+def _fitted(experiment: Experiment, candidate: PromisingCurve) -> State:
     """Fit all parameters and the curve, of whose coefficients it is known what they are a priori."""
     state, effect = candidate.state, candidate.effect
     effects = (*state.effects, effect)
