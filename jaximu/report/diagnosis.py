@@ -170,7 +170,8 @@ def _causes(diagnosis: Diagnosis) -> str:
     return "; ".join(texts)
 
 
-def _gained(diagnosis: Diagnosis) -> str:
+def gained(diagnosis: Diagnosis) -> str:
+    """Say what modelling the causes, or else the smooth curve, gains on data that was not fitted."""
     gain = diagnosis.gain
     learned = diagnosis.learned
     effects = [cause.effect for cause in diagnosis.named]
