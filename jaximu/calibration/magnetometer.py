@@ -243,10 +243,11 @@ def _calibrated(
     if wider is not None:
         fit = replace(fit, covariance=wider)
         notes.append(_ALIKE_ERRORS)
-    if windows.turn.any():
-        shifts = _wrong_turns(fit, windows, field, full, logs, motions, _uncertain_turns(unit, base))
-        fit = replace(fit, covariance=fit.covariance + shifts.T @ shifts)
-    fit = informed(fit, _data_sheet(fit, start))
+    known_gains = _data_sheet(fit, start)
+    uncertain = _uncertain_turns(unit, base) if windows.turn.any() else np.zeros((0, 3, 3))
+    shifts = _wrong_turns(fit, known_gains, windows, field, full, logs, motions, uncertain)
+    fit = informed(fit, known_gains)
+    fit = replace(fit, covariance=fit.covariance + shifts.T @ shifts)
     spreads, headings = _left_out(fit, start, windows, field, full, _samples(logs, parts))
     dip, dip_sigma = _dip(windows, fit)
     notes += stretches
@@ -345,6 +346,7 @@ def _uncertain_turns(unit: Imu, base: Calibration | None) -> FloatArray:
 
 def _wrong_turns(
     fit: Fit,
+    known: Prior,
     windows: FieldWindows,
     field: FieldStrength,
     full: bool,
@@ -352,18 +354,19 @@ def _wrong_turns(
     motions: Sequence[Recording | None],
     errors: FloatArray,
 ) -> FloatArray:
-    """Return how the numbers (k, p) of a fit change where the rates are off by shares (k, 3, 3) of themselves.
+    """Return how the numbers (k, p) of an informed fit change where rates are off by shares (k, 3, 3) of themselves.
 
     They turn the field that is carried, and with it the magnetometer's axes. They are no part of what the fit weighs:
     beside strengths, which they do not reach, turns would hardly count.
     """
-    used, changes = {name: getattr(windows, name) for name in ("used", "turn", "level")}, []
-    for error in errors:
+    used = {name: getattr(windows, name) for name in ("used", "turn", "level")}
+    changes = np.zeros((len(errors), len(fit.names)))
+    for change, error in zip(changes, errors, strict=True):
         wrong = [_turned(motion, error) for motion in motions]
-        other = FieldWindows.joined(_windows(logs, wrong, windows.origin, windows.vertical))
-        refitted = _fitted(fit.imu, replace(other, **used), field, full, np.asarray(fit.excess))
-        changes.append(np.asarray(refitted.values) - np.asarray(fit.values))
-    return np.array(changes)
+        other = replace(FieldWindows.joined(_windows(logs, wrong, windows.origin, windows.vertical)), **used)
+        refitted = replace(_fitted(fit.imu, other, field, full, np.asarray(fit.excess)), covariance=fit.covariance)
+        change[:] = informed(refitted, known).values - informed(fit, known).values
+    return changes
 
 
 def _turned(motion: Recording | None, error: FloatArray) -> Recording | None:
