@@ -286,7 +286,7 @@ class _Parts:
 
 
 def _fitted(experiment: Experiment, candidate: PromisingCurve) -> State:
-    """Fit all parameters and the curve, of whose coefficients it is known what they are a priori."""
+    """Fit all parameters and the curve, with what is known of its coefficients beforehand."""
     state, effect = candidate.state, candidate.effect
     effects = (*state.effects, effect)
     owned = state.imu.with_effects(*effects).all_effects()
