@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +17,16 @@ from jaximu.calibration.in_use import INTERVAL, FilterInUse, follow
 from jaximu.calibration.recipe import Choices, calibrate_ready, require_gravity
 from jaximu.calibration.systematic import noise_at_rest
 from jaximu.data.by_hand import RecordedByHand
-from jaximu.diagnosis.comparison import FollowedUnit, Fresh, Old, Question, Widened, candidates, scatter_about_a_fit
+from jaximu.diagnosis.comparison import (
+    Explanation,
+    FollowedUnit,
+    Fresh,
+    Old,
+    Question,
+    Widened,
+    candidates,
+    scatter_about_a_fit,
+)
 from jaximu.diagnosis.evidence import FEWEST_DIMENSIONS
 from jaximu.diagnosis.experiment import Experiment
 from jaximu.diagnosis.noise import usual_noise
@@ -172,12 +181,10 @@ def _compared(
     _same_gains(old, fresh, name, unlike)
     enough = len(conditions) - len(old.names) >= FEWEST_DIMENSIONS and bool(fresh.known(old).all())
     others = candidates(old, experiment) if enough else []
-    question = Question.ask(old, Widened(experiment, scatter).predict(old.imu), others)
-    selection = select(question.evidence, level)
+    question, selection = _questioned(old, Widened(experiment, scatter), others, level)
     if not selection.complete:
         scatter = scatter_about_a_fit(old, experiment, fresh)
-        question = Question.ask(old, Widened(experiment, scatter).predict(old.imu), others)
-        selection = select(question.evidence, level)
+        question, selection = _questioned(old, Widened(experiment, scatter), others, level)
     known = fresh.known(old)
     causes = tuple(
         cause
@@ -207,26 +214,36 @@ def _compared(
         conditions=(conditions, fresh.conditions),
         data=provenance(data.recordings) | data.counts(),
     )
+    notes += _limits_of_comparison(validity, enough)
+    comparable = all(shift.comparable for shift in validity.shifts)
+    errors = _output_errors(old, fresh, data) if comparable else {}
+    return replace(validity, output_errors=errors, notes=tuple(dict.fromkeys(notes)))
+
+
+def _questioned(old: Old, predicting: Widened, others: list[Explanation], level: float) -> tuple[Question, Selection]:
+    question = Question.ask(old, predicting.predict(old.imu), others)
+    return question, select(question.evidence, level)
+
+
+def _limits_of_comparison(validity: Validity, enough: bool) -> Iterator[str]:
+    """Say what the recording could not tell, `enough` where its freedom suffices to ask for effects."""
     unknown = [shift.name for shift in validity.shifts if not shift.comparable]
     if unknown:
-        notes.append(
+        yield (
             f"the recording's poses and turns are too few or too alike to determine {len(unknown)} of "
             f"{len(validity.shifts)} parameters, which were not compared: {', '.join(unknown)}."
         )
     if not enough:
-        notes.append(
-            "too few poses and turns to ask for effects of the session: record twenty poses or more to separate "
-            "them from "
-            "parameters that moved."
+        yield (
+            "too few poses and turns to ask for effects of the session: record twenty poses or more to separate them "
+            "from parameters that moved."
         )
-    if scatter.max() > 1:
-        widened = ", ".join(f"{name.replace('_', ' ')} {value:.1f}" for name, value in wide.items() if value > 1)
-        notes.append(
-            f"the recording scatters more than its noise about any calibration ({widened} times): the noise was "
-            "widened by it. `jaximu diagnose` seeks the reason."
+    wide = [f"{name.replace('_', ' ')} {value:.1f}" for name, value in validity.scatter.items() if value > 1]
+    if wide:
+        yield (
+            f"the recording scatters more than its noise about any calibration ({', '.join(wide)} times): the noise "
+            "was widened by it. `jaximu diagnose` seeks the reason."
         )
-    errors = {} if unknown else _output_errors(old, fresh, data)
-    return replace(validity, output_errors=errors, notes=tuple(dict.fromkeys(notes)))
 
 
 def _validity(
@@ -280,18 +297,8 @@ def _followed(
             raise why from None
     # what is common to both places is no error of the new one, as it is none of the old calibration's numbers
     there = LocalGravity(gravity.value, old.own)
-    known = [k for k, name in enumerate(calibration.names) if name.effect is None and name in old.names]
-    places = [old.names.index(calibration.names[k]) for k in known]
-    covariance = np.array(calibration.covariance)
-    covariance[np.ix_(known, known)] = submatrix(old.covariance, places)
-    covariance += _ROUNDING * np.diag(np.diagonal(covariance))  # it stays positive definite without gravity's share
-    follower = FilterInUse(
-        replace(calibration, covariance=covariance),
-        noise,
-        recording.gyroscope.rate,
-        there,
-        changing={"gyroscope": POWER_ON["gyroscope"]},
-    )
+    changing = {"gyroscope": POWER_ON["gyroscope"]}
+    follower = FilterInUse(_without_place(calibration, old), noise, recording.gyroscope.rate, there, changing=changing)
     history, diverged = follow(follower, recording)
     if np.sum(~history.rest) < 2:
         raise why
@@ -339,6 +346,16 @@ def _followed(
     if scatter > 1:
         notes.append(f"innovations scatter {scatter:.2g} times their noise: the noise was widened by it.")
     return replace(validity, notes=tuple(dict.fromkeys(notes)))
+
+
+def _without_place(calibration: Calibration, old: Old) -> Calibration:
+    """Return the calibration with the covariance that has no share of the gravity that both places have in common."""
+    known = [k for k, name in enumerate(calibration.names) if name.effect is None and name in old.names]
+    places = [old.names.index(calibration.names[k]) for k in known]
+    covariance = np.array(calibration.covariance)
+    covariance[np.ix_(known, known)] = submatrix(old.covariance, places)
+    covariance += _ROUNDING * np.diag(np.diagonal(covariance))  # it stays positive definite without gravity's share
+    return replace(calibration, covariance=covariance)
 
 
 def _told(follower: FilterInUse, old: Old, updates: int) -> tuple[FollowedUnit, float]:

@@ -79,7 +79,7 @@ def number(value: float, digits: int = 3) -> str:
     if not math.isfinite(value):
         return str(value)
     exponent = math.floor(math.log10(abs(value)))
-    if -5 <= exponent < 6:
+    if -4 <= exponent < 6:
         return f"{value:.{max(0, digits - 1 - exponent)}f}".replace("-", "−")
     mantissa, _, power = f"{value:.{digits - 1}e}".partition("e")
     return f"{mantissa}·10{raised(int(power))}".replace("-", "−")
@@ -106,10 +106,10 @@ def with_interval(value: float, sigma: float, unit: str = "", sign: bool = False
     if not half > 0:
         return joined(number(value, 6), printed)
     digits, plus = max(0, 1 - math.floor(math.log10(half))), "+" if sign else ""
-    if digits < 8:
+    power = math.floor(math.log10(max(abs(value), half)))
+    if power >= -4 and digits < 8:
         text = f"{value:{plus}z.{digits}f} ± {half:.{digits}f}"  # z: no minus before a zero
     else:
-        power = math.floor(math.log10(max(abs(value), half)))
         text = f"({value * 10.0**-power:{plus}z.{digits + power}f} ± {half * 10.0**-power:.{digits + power}f})"
         text += f"·10{raised(power)}"
     return joined(text.replace("-", "−"), printed)
