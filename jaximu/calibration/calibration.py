@@ -478,40 +478,14 @@ def _numbers(value: Any, shape: tuple[int, ...]) -> FloatArray:
 
 
 def _from_document(document: Json) -> Calibration:
-    from jaximu.model.effects.catalogue import CATALOGUE
-
-    def effects_of(entries: Json) -> tuple:
-        effects = []
-        for name, entry in entries.items():
-            kind = CATALOGUE[name]
-            inner = {key: float(parameter["value"]) for key, parameter in entry["inner"].items()}
-            effects.append(kind.make(_numbers(entry["coefficients"], (kind.size,)), **inner))
-        return tuple(effects)
-
-    def triad(name: str) -> Triad:
-        part: Json = document[name]
-        gain = _numbers(part["gain"], (3, 3))
-        if abs(np.linalg.det(unit_vectors(gain))) < 1e-6:
-            raise ValueError("the gain is singular")
-        effects = effects_of(part["effects"])
-        return Triad(
-            gain,
-            _numbers(part["bias"], (3,)),
-            effects,
-            SENSOR_QUANTITIES[name],
-            str(part["output_unit"]),
-            temperature_reference=float(part["temperature_reference"]),
-            time_reference=float(part["time_reference"]),
-        )
-
-    triads = {name: triad(name) for name in SENSOR_QUANTITIES if document.get(name) is not None}
+    triads = {name: _triad_of(document[name], name) for name in SENSOR_QUANTITIES if document.get(name) is not None}
     if not triads:
         raise KeyError("accelerometer")
     fit, gravity = document["fit"], document["setup"]["gravity"]
     imu = Imu(
         triads.get("accelerometer", Imu.nominal().accelerometer),
         triads.get("gyroscope"),
-        effects_of(document["setup"].get("effects", {})),
+        _effects_of(document["setup"].get("effects", {})),
         triads.get("magnetometer"),
     )
     known = {str(name): name for name in names_of(imu)}
@@ -557,6 +531,32 @@ def _from_document(document: Json) -> Calibration:
         magnetic={key: document.get(key) if key == "next" else document[key] for key in MAGNETIC}
         if "magnetometer" in triads
         else None,
+    )
+
+
+def _effects_of(entries: Json) -> tuple[Effect, ...]:
+    from jaximu.model.effects.catalogue import CATALOGUE
+
+    effects = []
+    for name, entry in entries.items():
+        kind = CATALOGUE[name]
+        inner = {key: float(parameter["value"]) for key, parameter in entry["inner"].items()}
+        effects.append(kind.make(_numbers(entry["coefficients"], (kind.size,)), **inner))
+    return tuple(effects)
+
+
+def _triad_of(part: Json, name: str) -> Triad:
+    gain = _numbers(part["gain"], (3, 3))
+    if abs(np.linalg.det(unit_vectors(gain))) < 1e-6:
+        raise ValueError("the gain is singular")
+    return Triad(
+        gain,
+        _numbers(part["bias"], (3,)),
+        _effects_of(part["effects"]),
+        SENSOR_QUANTITIES[name],
+        str(part["output_unit"]),
+        temperature_reference=float(part["temperature_reference"]),
+        time_reference=float(part["time_reference"]),
     )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -126,11 +126,8 @@ def deviation(
     - `resolution`: "full", or for the overlapping Allan deviation "multi", faster on long recordings: averages of 64
       samples and more take every second, fourth, … phase point, so that 32 to 64 of them are left an averaging time.
       Factors are rounded to multiples of that step, by 1.6 % at most, but down by up to 3 % where the recording ends;
-      `Deviation.tau` and `factor` hold those taken, once each. The square stays unbiased, and its variance grows by
-      less than 0.13 % for white noise, 5/4 (1/k² − 1/m²) of k points and m samples an average (after SP 1065, table
-      6), and by less than 0.01 % for flicker and random walk: their differences hardly change from one point to the
-      next. White phase noise (quantisation, α > 0) does change: where it rules averages of 64 samples and more, take
-      the full one.
+      `Deviation.tau` and `factor` hold those taken, once each. The square stays unbiased. Where quantisation (α > 0)
+      rules averages of 64 samples and more, take the full one.
 
     Memory beside the input is that of three rows for each processor. Raises `InputError` for shapes, rates
     and factors that make no sense, `NotPossibleError` where the data is too short or gaps leave fewer than two
@@ -139,20 +136,9 @@ def deviation(
     difference = _kind(kind)
     data = np.asarray(values, float)
     _require_sense(data, rate, difference, phase, confidence)
-    if resolution not in RESOLUTIONS:
-        raise InputError(f"the resolution must be one of {', '.join(RESOLUTIONS)}, found {resolution!r}.")
-    multi = resolution == "multi"
-    if multi and kind != "overlapping":
-        raise InputError(f"the multi-resolution deviation is the overlapping Allan deviation, not the {kind} one.")
     rows = data.reshape(-1, data.shape[-1])
     samples = data.shape[-1] - phase
-    chosen = averaging_factors(samples, kind) if factors is None else np.unique(np.asarray(factors, np.int64))
-    if not len(chosen) or chosen[0] < 1 or chosen[-1] > _longest(samples, kind):
-        raise NotPossibleError(
-            f"{samples} samples allow averaging over 1 to {_longest(samples, kind)} of them for the {kind} "
-            f"deviation, asked were {np.asarray(factors).tolist()}."
-        )
-    grid = _grid(chosen, samples, difference, multi)
+    grid = _wanted_grid(factors, samples, kind, resolution)
 
     def analysed(row: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
         points, lost = (row, None) if phase else _integrated(row)
@@ -170,11 +156,8 @@ def deviation(
     tau = grid.factor / rate
     # an integrated signal is summed here in samples, a given phase in seconds
     value = np.sqrt(square / (6 if difference.order == 3 else 2)) / (tau if phase else grid.factor)
-    freedom = np.zeros(value.shape)
-    for row, column in np.ndindex(*value.shape):
-        m, lag, a = (int(number) for number in (grid.factor[column], grid.lag[column], alpha[row, column]))
-        freedom[row, column] = degrees_of_freedom(kind, samples + 1, m, a, lag)
-    freedom *= np.minimum(1.0, count / np.maximum(1, grid.count))
+    full = np.vectorize(partial(degrees_of_freedom, kind, samples + 1), [float])(grid.factor, alpha, grid.lag)
+    freedom = full * np.minimum(1.0, count / np.maximum(1, grid.count))
     distinct, index = np.unique(freedom, return_inverse=True)
     low, high = deviation_interval(distinct, confidence)[:, index.ravel()].reshape(2, *value.shape)
     shape = (*data.shape[:-1], len(tau))
@@ -182,6 +165,21 @@ def deviation(
         array.reshape(shape) for array in (value, value * low, value * high, count, alpha, freedom)
     )
     return Deviation(kind, tau, grid.factor, value, low, high, count, alpha, freedom, confidence)
+
+
+def _wanted_grid(factors: ArrayLike | None, samples: int, kind: str, resolution: str) -> _Grid:
+    if resolution not in RESOLUTIONS:
+        raise InputError(f"the resolution must be one of {', '.join(RESOLUTIONS)}, found {resolution!r}.")
+    multi = resolution == "multi"
+    if multi and kind != "overlapping":
+        raise InputError(f"the multi-resolution deviation is the overlapping Allan deviation, not the {kind} one.")
+    chosen = averaging_factors(samples, kind) if factors is None else np.unique(np.asarray(factors, np.int64))
+    if not len(chosen) or chosen[0] < 1 or chosen[-1] > _longest(samples, kind):
+        raise NotPossibleError(
+            f"{samples} samples allow averaging over 1 to {_longest(samples, kind)} of them for the {kind} "
+            f"deviation, asked were {np.asarray(factors).tolist()}."
+        )
+    return _grid(chosen, samples, KINDS[kind], multi)
 
 
 def require_samples(data: FloatArray, rate: float, confidence: float) -> None:
@@ -228,6 +226,8 @@ def _grid(factors: IntArray, samples: int, kind: _DeviationKind, multi: bool) ->
     highest = max(0, (samples // (2 * _FINEST + 1)).bit_length() - 1)
     level = np.array([min(max(0, (int(m) // _FINEST).bit_length() - 1), highest) for m in factors])
     step = 1 << level
+    # Of k points and m samples an average the variance of the square grows by 5/4 (1/k² − 1/m²), less than 0.13 %, for
+    # white noise (after SP 1065, table 6), by less than 0.01 % for flicker and random walk.
     # to the nearest multiple that leaves two differences
     lag = np.minimum((factors + step // 2) // step, ((samples >> level) - 1) // 2)
     even = (lag == 2 * _FINEST) & (samples >> (level + 1) > 2 * _FINEST)  # a factor rounded up to the next level's

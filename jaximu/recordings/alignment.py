@@ -392,34 +392,7 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     places = np.array([blocks.centre[a:b].mean() for a, b in pairwise(edges)]) - middle
     changes, levers = blocks.weight[:, None] * blocks.change, _levers(blocks)
 
-    def sums(lag: float) -> tuple[FloatArray, FloatArray]:
-        """Return the normal matrix (P, 9, 9) and vector (P, 9) of each part."""
-        columns = _columns(levers, blocks.turned(lag)).reshape(-1, 3, 9)
-        both = columns.swapaxes(1, 2) @ np.concatenate([columns, changes[:, :, None]], axis=2)
-        both = np.add.reduceat(both, edges[:-1])
-        return both[..., :9], both[..., 9]
-
-    def left(normal: FloatArray, product: FloatArray, power: FloatArray | float) -> FloatArray:
-        """Return what the best matrix leaves of the sums of squares `power` (...)."""
-        inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
-        return power - np.einsum("...i,...ij,...j->...", product, inverse, product)
-
-    line = np.zeros(2)  # of the lag: at the middle, and by time
-    power = np.add.reduceat((changes**2).sum(axis=1), edges[:-1])
-    whole = power.sum()
-    enough = (1 - _WELL) * whole
-    normal, product = sums(0.0)
-    if left(normal.sum(axis=0), product.sum(axis=0), whole) > enough:
-        normal, product = (np.array(sums_at_lags) for sums_at_lags in zip(*map(sums, _LAGS), strict=True))
-        common = left(normal.sum(axis=1), product.sum(axis=1), whole)
-        line[0] = _LAGS[np.argmin(common)]
-        if min(common) > enough:
-            residuals = left(normal, product, power)
-            best = np.argmin(residuals, axis=0)
-            trusted = residuals.min(axis=0) < (1 - _WELL) * power
-            if trusted.sum() >= 3:
-                robust = scipy.stats.theilslopes(_LAGS[best[trusted]], places[trusted], method="joint")
-                line = np.array([robust.intercept, robust.slope])
+    line, power = _rough_line(blocks, levers, changes, edges, places), (changes**2).sum()
     for step in _STEPS:
         lag = line[0] + line[1] * (blocks.centre - middle)
         turned = blocks.turned(lag)
@@ -447,5 +420,46 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     spread = max(spread * float(student_isf(0.025, freedom) / 1.96) ** 2, (rest**2).mean())
     sigma, drift_sigma = np.sqrt(spread * np.diag(inverse))
     columns = _columns(levers, blocks.turned(line[0] + line[1] * (blocks.centre - middle)))
-    explained = 1 - float(left(columns.T @ columns, columns.T @ changes.ravel(), whole)) / max(whole, 1e-300)
+    explained = 1 - float(_left(columns.T @ columns, columns.T @ changes.ravel(), power)) / max(power, 1e-300)
     return Clocks(float(line[0]), max(float(sigma), 1e-4), float(line[1]), float(drift_sigma), middle, explained)
+
+
+def _rough_line(
+    blocks: BlockMeans, levers: FloatArray, changes: FloatArray, edges: IntArray, places: FloatArray
+) -> FloatArray:
+    """Return the lag at the middle (s) and by time: none, one of a grid, or a robust line, whichever explains enough.
+
+    levers (n, 3, 3) and changes (n, 3) of the blocks, weighted; edges: of the parts, by block; places: their times, s
+    from the middle.
+    """
+
+    def sums(lag: float) -> tuple[FloatArray, FloatArray]:
+        """Return the normal matrix (P, 9, 9) and vector (P, 9) of each part."""
+        columns = _columns(levers, blocks.turned(lag)).reshape(-1, 3, 9)
+        both = columns.swapaxes(1, 2) @ np.concatenate([columns, changes[:, :, None]], axis=2)
+        both = np.add.reduceat(both, edges[:-1])
+        return both[..., :9], both[..., 9]
+
+    line = np.zeros(2)
+    power = np.add.reduceat((changes**2).sum(axis=1), edges[:-1])
+    enough = (1 - _WELL) * power.sum()
+    normal, product = sums(0.0)
+    if _left(normal.sum(axis=0), product.sum(axis=0), power.sum()) <= enough:
+        return line
+    normal, product = (np.array(sums_at_lags) for sums_at_lags in zip(*map(sums, _LAGS), strict=True))
+    common = _left(normal.sum(axis=1), product.sum(axis=1), power.sum())
+    line[0] = _LAGS[np.argmin(common)]
+    if min(common) > enough:
+        residuals = _left(normal, product, power)
+        best = np.argmin(residuals, axis=0)
+        trusted = residuals.min(axis=0) < (1 - _WELL) * power
+        if trusted.sum() >= 3:
+            robust = scipy.stats.theilslopes(_LAGS[best[trusted]], places[trusted], method="joint")
+            line = np.array([robust.intercept, robust.slope])
+    return line
+
+
+def _left(normal: FloatArray, product: FloatArray, power: FloatArray | float) -> FloatArray:
+    """Return what the best matrix leaves of the sums of squares `power` (...)."""
+    inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
+    return power - np.einsum("...i,...ij,...j->...", product, inverse, product)

@@ -682,16 +682,7 @@ def _rising(table: LogTable, clock: int, unit: Unit) -> LogTable:
     steps = np.diff(stamps)
     if not (steps <= 0).any() or np.isnan(stamps).any():
         return table
-
-    def listed(rows: np.ndarray) -> str:
-        return ", ".join(str(table.row(row)) for row in rows[:5])
-
-    notes = []
-    usual = np.median(np.abs(steps[steps != 0])) if (steps != 0).any() else 0.0
-    count = len(stamps)
-    order = np.arange(count)
     back = np.flatnonzero(steps < 0) + 1
-    backwards = len(back) > 0.9 * (count - 1)
     if len(back) and (even := _even_clock(stamps)) is not None:
         spread = np.std(stamps - even) * unit.factor
         text = (
@@ -699,49 +690,69 @@ def _rising(table: LogTable, clock: int, unit: Unit) -> LogTable:
             "the rows are in order: a steady clock fitted to the stamps replaces them."
         )
         return table.with_column(clock, even).noted(Defect("data.jitter", text))
-    if len(back):
-        order = np.argsort(stamps, kind="stable")
-        if backwards:
-            # rows of one stamp keep the order that they have when the file is read backwards
-            order = count - 1 - np.argsort(stamps[::-1], kind="stable")
-            text = "The rows run backwards in time. They were sorted by their stamps."
-        else:
-            farthest = np.max(np.maximum.accumulate(stamps) - stamps) * unit.factor
-            text = (
-                f"The rows are out of order in {counted(len(back), 'place')} (row {listed(back)}), by up to "
-                f"{farthest:.6g} s. They were sorted by their stamps."
-            )
-        notes.append(Defect("data.order", text))
-    # where two rows have one stamp and are alike, one of them was written twice
-    repeats = np.flatnonzero(np.diff(stamps[order]) == 0) + 1
-    for column in table.columns:
-        values, before = column[order[repeats]], column[order[repeats - 1]]
-        repeats = repeats[(values == before) | ((values != values) & (before != before))]
+    order, notes = _by_stamp(table, stamps, back, unit)
+    repeats = _repeats(table, order, stamps)
     kept = np.delete(order, repeats)
     if len(repeats):
         block = "" if len(back) else " one after the other"
         text = (
             f"{counted(len(repeats), 'row')} repeat others with the same stamp{block} "
-            f"(row {listed(np.sort(order[repeats]))} …). They were left out."
+            f"({_rows(table, np.sort(order[repeats]))} …). They were left out."
         )
-        if not backwards and (np.diff(stamps[np.sort(kept)]) >= 0).all():
+        if (np.diff(stamps[np.sort(kept)]) >= 0).all():
             notes = []  # the rows that are kept are in order
         notes.append(Defect("data.duplicate", text))
     kept_steps = np.diff(stamps[kept])
+    usual = np.median(np.abs(steps[steps != 0])) if (steps != 0).any() else 0.0
     # of two runs that are sorted into each other every other step is at most half of the usual one
     close, before = (int(np.sum((gaps >= 0) & (gaps < _HALVED * usual))) for gaps in (kept_steps, steps))
-    if len(back) and close > max(20, 0.02 * count) + before:
+    if len(back) and close > max(20, 0.02 * len(stamps)) + before:
         row = back[steps[back - 1].argmin()]
         raise InputError(
             f"{table.where(row)}: the clock goes back by {-steps[row - 1] * unit.factor:.6g} s, and the rows "
             "from there on are not those of the same times before: two recordings in one file (data.order). Cut it "
             "there."
         )
-    shared = kept_steps == 0
-    if len(back) and (shared.any() or close > before):
+    if len(back) and ((kept_steps == 0).any() or close > before):
         return table  # sorting does not help: stamps are wrong, and which, the refusal says
-    table, stamps = table.take(kept).noted(*notes), stamps[kept]
-    often = not len(back) and shared.sum() >= _FEW_SHARED and _FEW_SHARES < shared.mean() <= 0.25
+    return _apart(table.take(kept).noted(*notes), clock, unit, usual, in_order=not len(back))
+
+
+def _rows(table: LogTable, rows: np.ndarray) -> str:
+    return "row " + ", ".join(str(table.row(row)) for row in rows[:5])
+
+
+def _by_stamp(table: LogTable, stamps: np.ndarray, back: np.ndarray, unit: Unit) -> tuple[np.ndarray, list[Defect]]:
+    """Return the order of the rows by their stamps, which go back at rows `back`, and what is to be said of it."""
+    count = len(stamps)
+    if not len(back):
+        return np.arange(count), []
+    if len(back) > 0.9 * (count - 1):
+        text = "The rows run backwards in time. They were sorted by their stamps."
+        # rows of one stamp keep the order that they have when the file is read backwards
+        return count - 1 - np.argsort(stamps[::-1], kind="stable"), [Defect("data.order", text)]
+    farthest = np.max(np.maximum.accumulate(stamps) - stamps) * unit.factor
+    text = (
+        f"The rows are out of order in {counted(len(back), 'place')} ({_rows(table, back)}), by up to "
+        f"{farthest:.6g} s. They were sorted by their stamps."
+    )
+    return np.argsort(stamps, kind="stable"), [Defect("data.order", text)]
+
+
+def _repeats(table: LogTable, order: np.ndarray, stamps: np.ndarray) -> np.ndarray:
+    """Return which of the ordered rows are like the one before, stamp and all: one of them was written twice."""
+    repeats = np.flatnonzero(np.diff(stamps[order]) == 0) + 1
+    for column in table.columns:
+        values, before = column[order[repeats]], column[order[repeats - 1]]
+        repeats = repeats[(values == before) | ((values != values) & (before != before))]
+    return repeats
+
+
+def _apart(table: LogTable, clock: int, unit: Unit, usual: float, in_order: bool) -> LogTable:
+    """Put apart rows that share a stamp, `usual` being the step between others: by a steady clock, or by nothing."""
+    stamps = table.numbers(clock)
+    shared = np.diff(stamps) == 0
+    often = in_order and shared.sum() >= _FEW_SHARED and _FEW_SHARES < shared.mean() <= 0.25
     if often and (even := _even_clock(stamps)) is not None:
         rate = (len(even) - 1) / ((even[-1] - even[0]) * unit.factor)
         text = (
@@ -750,7 +761,7 @@ def _rising(table: LogTable, clock: int, unit: Unit) -> LogTable:
         )
         return table.with_column(clock, even).noted(Defect("data.jitter", text))
     if shared.mean() > 0.25:  # bursts with one time of arrival for all their rows
-        number = np.arange(len(kept))
+        number = np.arange(len(stamps))
         position = number - np.maximum.accumulate(np.where(np.concatenate([[True], ~shared]), number, 0))
         table = table.with_column(clock, stamps.astype(float) + 1e-4 * usual * position)
     return table
