@@ -31,6 +31,7 @@ from jaximu.data.poses import residual_rms
 from jaximu.estimation.fitting import Fit, Prior, fit
 from jaximu.estimation.information_filter import Knowledge
 from jaximu.estimation.problem import TOLERANCE, Name, Parameters, flatten, typical_sizes, without_equipment_or_effects
+from jaximu.estimation.rows import Sizes
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.uncertainty import label, pose_advice
 from jaximu.ground.array_types import FloatArray
@@ -201,25 +202,9 @@ def calibrate_by_filter(
         stated = {**{effect.name: effect.known for effect in outside}, **(effect_sigmas or {}), earth.name: spread}
         known_before, prior = Prior.of_effects(imu, stated), Prior.of_effects(imu, plausible_sizes(imu) | stated)
         assert known_before is not None and prior is not None
-        free = Parameters.select(imu, without_equipment_or_effects)
-        for _ in range(_ROUNDS):
-            fitted = fit(imu, measurement, prior=prior, follow=True)
-            if mounted is None:  # else the attitude tells what poses and turns leave open
-                _require_enough_turned(fitted, start, recording.name)
-            require_solved(fitted, recording.name)
-            imu = on_host(fitted.imu)
-            followed = _followed(measurement, imu, free, prior, gravity, start)
-            matched = _matched(measurement, followed)
-            if matched is None:
-                break
-            measurement = matched
+        fitted, followed, measurement = _settled(imu, measurement, prior, start, gravity, mounted)
     refuse_undetermined(fitted, known_before, wholly=True)
-    assert start.observations is not None and start.nominal is not None
-    before, cleaned = residual_rms(start.nominal, start.observations), start.observations
-    if chosen:
-        names = {effect.name for effect in chosen}
-        terms = tuple(effect for effect in imu.all_effects().values() if effect.name in names)
-        cleaned = RecordedByHand(start.segmentations, start.observations).along(imu, terms).observations
+    imu = on_host(fitted.imu)
     calibration = concluded(
         fitted,
         advice=state_advice,
@@ -227,7 +212,7 @@ def calibrate_by_filter(
         method="filter",
         loss="linear",
         excess_names=measurement.excess_names,
-        rms=[before, residual_rms(imu.with_effects(), cleaned)],
+        rms=_errors_of_poses(start, imu, {effect.name for effect in chosen}),
         known=known_before.names,
         data=start.data,
         notes=[
@@ -245,16 +230,49 @@ def calibrate_by_filter(
     if mounted is not None:
         smoothed = {"filter": mounted.summary["filter"]}  # as it was found first
         calibration = replace(calibration, reference=reference_summary(calibration) | smoothed)
-    history = _history(measurement, followed, free, imu)
+    history = _history(measurement, followed, imu)
     scale = _scaled_noise(measurement.errors, noise, float(fitted.excess[0]))
-    summary = _summary(calibration, history, free.names, measurement.errors.correlation_time, scale)
+    summary = _summary(calibration, history, measurement.errors.correlation_time, scale)
     return replace(calibration, filter=summary), history
+
+
+def _settled(
+    imu: Imu,
+    measurement: IntervalsOfMotion,
+    prior: Prior,
+    start: Calibration,
+    gravity: LocalGravity,
+    mounted: Mounted | None,
+) -> tuple[Fit, FilterPass, IntervalsOfMotion]:
+    """Repeat fit and filter until innovations are what the noise says, or `_ROUNDS` times."""
+    name = start.segmentations[0].recording.name
+    for _ in range(_ROUNDS):
+        fitted = fit(imu, measurement, prior=prior, follow=True)
+        if mounted is None:  # else the attitude tells what poses and turns leave open
+            _require_enough_turned(fitted, start, name)
+        require_solved(fitted, name)
+        imu = on_host(fitted.imu)
+        followed = _followed(measurement, imu, prior, gravity, start)
+        matched = _matched(measurement, followed)
+        if matched is None:
+            break
+        measurement = matched
+    return fitted, followed, measurement
+
+
+def _errors_of_poses(start: Calibration, imu: Imu, effects: set[str]) -> list[Sizes]:
+    """Return the errors of poses and turns by the data sheet, and by the unit with its effects of those names."""
+    assert start.observations is not None and start.nominal is not None
+    terms = tuple(effect for effect in imu.all_effects().values() if effect.name in effects)
+    cleaned = RecordedByHand(start.segmentations, start.observations)
+    if terms:
+        cleaned = cleaned.along(imu, terms)
+    return [residual_rms(start.nominal, start.observations), residual_rms(imu.with_effects(), cleaned.observations)]
 
 
 def _summary(
     calibration: Calibration,
     history: History,
-    names: Sequence[Name],
     correlation_time: FloatArray,
     scale: Mapping[str, float],
 ) -> Json:
@@ -263,6 +281,7 @@ def _summary(
     Of effects, weak directions that are determined all the same are no open states.
     """
     drifts = [f"{triad} drift, {time:.3g} s" for time in correlation_time for triad in ("gyroscope", "accelerometer")]
+    names = history.names
     of_effects = {name for name in names if name.effect is not None}
     return {
         "states": ["attitude", "velocity", *drifts, *(label(name, calibration.imu) for name in names), "gravity"],
@@ -371,10 +390,11 @@ def _scaled_noise(errors: Disturbances, noise: NoiseModel, excess: float) -> dic
 
 
 def _followed(
-    measurement: IntervalsOfMotion, imu: Imu, free: Parameters, prior: Prior, gravity: LocalGravity, start: Calibration
+    measurement: IntervalsOfMotion, imu: Imu, prior: Prior, gravity: LocalGravity, start: Calibration
 ) -> FilterPass:
     """Return how a filter that begins with the data sheet comes to know the free numbers."""
     assert start.nominal is not None
+    free = Parameters.select(imu, without_equipment_or_effects)
     nominal = start.nominal.with_effects(*imu.all_effects().values())
     index = list(free.index)
     reference = flatten(imu)[index]
@@ -411,8 +431,8 @@ def _matched(measurement: IntervalsOfMotion, followed: FilterPass) -> IntervalsO
     return replace(measurement, errors=scaled)
 
 
-def _history(measurement: IntervalsOfMotion, followed: FilterPass, free: Parameters, imu: Imu) -> History:
-    intervals = measurement.intervals
+def _history(measurement: IntervalsOfMotion, followed: FilterPass, imu: Imu) -> History:
+    intervals, free = measurement.intervals, Parameters.select(imu, without_equipment_or_effects)
     real = intervals.real > 0
     inside = intervals.length > 0
     time = np.where(inside, intervals.time[:, -inside.shape[1] :], -np.inf).max(axis=1)[real]
