@@ -406,26 +406,17 @@ def diagnose(
             held = recorded_by_hand(other)
         data = recorded_by_hand(calibration)
         lines = moving_lines(data.segmentations)
-        swings, diagnosis = swings_of(data.segmentations, lines), None
-        for off in (False, True) if swings else (False,):
-            before, diagnosis = (
-                diagnosis,
-                examine(
-                    Examination.of(
-                        calibration,
-                        data.without_swings(swings) if off else data,
-                        noise_of(static),
-                        held,
-                        names,
-                        findings=(*findings, *unusual),
-                        notes=tuple(notes),
-                        known=tuple(known),
-                        level=level,
-                        naming=not spoiling,
-                    )
-                ),
+
+        def examined(data: Data) -> Diagnosis:
+            about = {"findings": (*findings, *unusual), "level": level, "naming": not spoiling}
+            examination = Examination.of(
+                calibration, data, noise_of(static), held, names, tuple(notes), tuple(known), **about
             )
-        assert diagnosis is not None
+            return examine(examination)
+
+        diagnosis, before = examined(data), None
+        if swings := swings_of(data.segmentations, lines):
+            diagnosis, before = examined(data.without_swings(swings)), diagnosis
         diagnosis = _with_lines(diagnosis, before, lines)
     if diagnosis.verdict != "adequate" and not spoiling:  # what a repair could not find may look like an effect
         spoiling = [finding for finding in findings if finding.partial]
