@@ -92,7 +92,7 @@ def _kept_folder() -> Path:
 def few_memory_maps() -> None:
     """Let go of compiled code, which lies in memory maps, before the 65530 that Linux gives a process run out."""
     maps = Path("/proc/self/maps")
-    if not maps.exists() or maps.read_bytes().count(b"\n") <= 25_000:
+    if not maps.exists() or maps.read_bytes().count(b"\n") <= 40_000:
         return
     import jax  # after `environment`
 

@@ -98,7 +98,7 @@ INPUTS = (poses, six, three, rest, rest_in_g, gyroscope_at_rest, accelerometer_a
 COMMANDS = ("jaximu info log.csv", "jaximu log.csv --yes", "jaximu calibrate log.csv", "jaximu allan log.csv")
 WHOLE = "jaximu log.csv --yes"
 SLOW = {(poses, WHOLE), (no_units, WHOLE), (six, WHOLE), (two_units, WHOLE)} | {
-    (two_units, f"jaximu {verb} log.csv") for verb in ("info", "allan")
+    (two_units, f"jaximu {verb} log.csv") for verb in ("info", "allan", "calibrate")
 }
 
 

@@ -139,7 +139,12 @@ PROTOCOLS = {
 
 @pytest.mark.parametrize(
     ("protocol", "grade", "drifts"),
-    [("hand-held", 0.01, 0), ("tracked", 1.0, 2), ("magnetic", 1.0, 2), ("single-axis-table", 1.0, 2)],
+    [
+        ("hand-held", 0.01, 0),
+        ("tracked", 1.0, 2),
+        pytest.param("magnetic", 1.0, 2, marks=pytest.mark.slow),
+        pytest.param("single-axis-table", 1.0, 2, marks=pytest.mark.slow),
+    ],
 )
 def test_the_fit_is_the_least_squares_solution_of_all_states_and_numbers(protocol, grade, drifts):
     """Numbers, iterated to convergence, against dense Gauss–Newton steps over every state at once."""

@@ -477,6 +477,7 @@ def affected(cases):
 
 TRUE = {"mag.lag": [0.02] * 3, "mag.current": [3.0, -2.0, 1.0], "mag.temperature": [0.3, -0.2, 0.1],
         "mag.hard_iron_step": [4.0, 0.0, -6.0]}  # fmt: skip
+ALIKE = {"mag.current", "mag.temperature"}  # a number an axis times what is logged, as the step, whose onset is sought
 
 
 @pytest.fixture(scope="module")
@@ -491,7 +492,7 @@ def extended(affected):
     return of
 
 
-@pytest.mark.parametrize("name", TRUE)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in ALIKE else ()) for name in TRUE])
 def test_an_effect_is_named_and_fitted(name, affected, extended, cases):
     found, measurement, _ = calibrate_magnetometer([affected[name]], FieldStrength(48.0))
     asked = diagnose_magnetometer(found, measurement)

@@ -63,6 +63,7 @@ def test_rotations_one_by_one_tell_what_the_whole_sequence_does(asked):
     np.testing.assert_allclose(one_by_one, whole, rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_errors_of_the_filter_are_those_predicted(proposal, asked):
     """χ² of 21 numbers of each unit that the filter calibrates from the proposed sequence, with noise."""
     kept = [place for place in range(len(asked.names)) if place not in asked.earth]

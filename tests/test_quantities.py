@@ -60,6 +60,7 @@ def test_value_and_interval_share_decimals_and_unit(value, sigma):
         (0.0021, "(m/s^2)/K", "2.10 (mm/s²)/K"),
         (2e-4, "(rad/s)/(m/s^2)", "0.0115 (°/s)/(m/s²)"),
         (3e-4, "(m/s^2)/(m/s^2)^2", "0.000300 1/(m/s²)"),
+        (1.48e-5, "(m/s^2)/(m/s^2)^2", "1.48·10⁻⁵ 1/(m/s²)"),
     ],
 )
 def test_units_are_those_a_person_compares(value, unit, text):
@@ -87,6 +88,7 @@ def test_typography_of_units(unit, printed):
 
 
 def test_several_values_share_a_unit():
+    assert with_interval(-1.48e-5, 2e-6) == "(−1.48 ± 0.39)·10⁻⁵"
     assert with_intervals([0.002, 1e-4], [1e-4, 1e-5], "m/s^2") == ["2.00 ± 0.20 mm/s²", "0.100 ± 0.020 mm/s²"]
     assert change(0.0111, 6.7e-4, "m/s^2") == "11.1 → 0.670 mm/s²" and change(2.0, 0.0, "rad") == "115 → 0°"
 

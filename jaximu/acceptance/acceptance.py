@@ -103,7 +103,7 @@ def judge(units: Units, limits: Limits) -> Judged:
             columns = {(axis,): start + axis for axis in range(3)}
         else:
             columns = {
-                _axes(name): column
+                tuple(map(int, name.partition("[")[2].rstrip("]").split(","))): column
                 for column, name in enumerate(measured.names[:first])
                 if name.partition("[")[0] == stem and limit.owner in held
             }
@@ -130,10 +130,6 @@ def judge(units: Units, limits: Limits) -> Judged:
         probability,
         verdict,
     )
-
-
-def _axes(name: str) -> tuple[int, ...]:
-    return tuple(map(int, name.partition("[")[2].rstrip("]").split(",")))
 
 
 def _not_stated(limit: Limit, units: Units, limits: Limits) -> str:

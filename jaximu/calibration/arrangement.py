@@ -103,7 +103,8 @@ def _axes(arranged: FloatArray) -> Finding:
     rivals: list[str] = []
     if np.linalg.det(arranged) > 0:
         causes += [("accelerometer", arranged), ("accelerometer", -arranged)]
-        causes = sorted(causes, key=lambda cause: _wrong(cause[1]))[:2]
+        # those of the fewest axes exchanged or turned round
+        causes = sorted(causes, key=lambda cause: (np.diag(cause[1]) != 1).sum() + (cause[1] < 0).sum())[:2]
         rivals.append("setup.mounting")
     name, repaired = causes[0]
     option = f"{'gyro' if name == 'gyroscope' else 'accel'}={spelled_axes(repaired)}"
@@ -126,11 +127,6 @@ def _axes(arranged: FloatArray) -> Finding:
         tuple(rivals),
         apply=lambda recording: apply_axes(recording, option),
     )
-
-
-def _wrong(matrix: FloatArray) -> int:
-    """Return how many axes of a map are exchanged or turned round."""
-    return int((np.diag(matrix) != 1).sum() + (matrix < 0).sum())
 
 
 def _described(matrix: FloatArray) -> str:

@@ -534,7 +534,7 @@ def _from_document(document: Json) -> Calibration:
     )
 
 
-def _effects_of(entries: Json) -> tuple[Effect, ...]:
+def _effects_of(entries: Json) -> tuple[Any, ...]:
     from jaximu.model.effects.catalogue import CATALOGUE
 
     effects = []

@@ -75,11 +75,6 @@ def slow_units(known: AxisNoise, shortest: float, duration: float) -> dict[str, 
     }
 
 
-def _power_on(known: AxisNoise) -> AxisNoise:
-    """Return a triad's bias that is another in every recording, at a size of one, as `USUAL_DRIFT` has it."""
-    return AxisNoise(np.zeros(3), np.zeros(3), known.covariance([0.0], [1.0])[:, 0], np.array([_FOREVER]))
-
-
 def with_noise(noise: NoiseModel, triad: str, more: AxisNoise) -> NoiseModel:
     """Return a noise model with further slow noise of a triad."""
     known = getattr(noise, triad)
@@ -242,7 +237,10 @@ def drift_components(
         known = getattr(noise, triad)
         drifts = slow_units(known, float(np.median(stop - start)), duration) if known and within else {}
         if known and len(parts) > 1 and triad == "accelerometer":
-            drifts[_POWER_ON] = _power_on(known)
+            # another bias in every recording, at a size of one, as `USUAL_DRIFT` has it
+            drifts[_POWER_ON] = AxisNoise(
+                np.zeros(3), np.zeros(3), known.covariance([0.0], [1.0])[:, 0], np.array([_FOREVER])
+            )
         for kind, unit in drifts.items():
             slow = np.square(means.scale[triad])[:, None, None] * unit.covariance(start, stop)
             slow *= which[:, None] == which

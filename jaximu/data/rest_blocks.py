@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from jaximu.estimation.track import TEMPERATURE_WINDOW, TRIADS, Track
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.differences import midpoints
-from jaximu.ground.distributions import robust_sigma
+from jaximu.ground.distributions import rms, robust_sigma
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import sentence
 from jaximu.ground.vectors import column_lengths, lengths_of
@@ -156,7 +156,7 @@ class RestBlocks:
         About the mean of each rest, whose gravity nothing tells; of a gyroscope about that of each recording.
         """
         group = self.rest if name == "accelerometer" else self.log
-        return np.sqrt(np.mean((values - _about(group, values)) ** 2, axis=0))
+        return rms(values - _about(group, values), axis=0)
 
     @property
     def spans(self) -> list[float]:

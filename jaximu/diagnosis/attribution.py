@@ -31,7 +31,7 @@ from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.estimation.track import TRIADS
 from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.differences import interpolated
-from jaximu.ground.distributions import chi2_sf
+from jaximu.ground.distributions import chi2_sf, rms
 from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
@@ -347,7 +347,7 @@ class CommonDrift:
             rates[1:] = _as_slow(rates, times, up, random)
         courses, shares = _principal(rates)
         loadings = courses[0] @ rates[0]
-        usual = float(np.sqrt(np.mean(loadings**2))) * (np.sign(courses[0][0]) or 1.0)
+        usual = rms(loadings) * (np.sign(courses[0][0]) or 1.0)
         pace = 1 / np.sqrt(np.diff(times))
         steep = np.linalg.lstsq(pace[:, None] * np.diff(up, axis=0), pace * np.diff(courses[0]), rcond=None)[0]
         curve = usual * (courses[0] - up @ steep)
@@ -684,7 +684,11 @@ def attribute(
                 parts[index] = min(part.repeated(second, known, index in steady), part, key=_rank)
     split_up, single, _ = attributed(list(parts.values()), common, level)
     lines, apart = attributed_lines(list(parts.values()), level)
-    findings, single = (*map(_of_drift, common), *split_up, *lines), single | apart
+    of_sessions = (
+        Attributed(COMMON_DRIFT, "session", tuple(drift.loadings), (drift.session,), drift.share, drift.p_value)
+        for drift in common
+    )
+    findings, single = (*of_sessions, *split_up, *lines), single | apart
     return Attribution(tuple(parts.values()), findings, tuple(drifts), single, skipped, gravity.latitude)
 
 
@@ -703,11 +707,6 @@ def _without_common_drift(
 def _rank(part: BoardRecording) -> tuple[bool, int, float]:
     """Return what of several diagnoses of a recording is kept by, the least: unexplained, effects, error left out."""
     return part.diagnosis["verdict"] == "unexplained", len(part.diagnosis["effects"]), part.chi2_heldout
-
-
-def _of_drift(drift: CommonDrift) -> Attributed:
-    """Return a common time course as a finding of its session."""
-    return Attributed(COMMON_DRIFT, "session", tuple(drift.loadings), (drift.session,), drift.share, drift.p_value)
 
 
 def attributed(

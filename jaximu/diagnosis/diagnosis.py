@@ -31,7 +31,7 @@ from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_n
 from jaximu.diagnosis.selection import Selection, select, shape_of
 from jaximu.estimation.data import Data
 from jaximu.estimation.fitting import fit
-from jaximu.estimation.rows import ResidualKind
+from jaximu.estimation.rows import ResidualKind, Sizes
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.document import SOFTWARE, Document, Json, entries
@@ -217,7 +217,7 @@ class Diagnosis(Result, Document, page="diagnosis"):
     preflight: tuple[Finding, ...]
     p_value: float
     unit: float
-    detection_limits: dict[str, tuple[float, str]]
+    detection_limits: Sizes
     not_observable: dict[str, str]
     checks: tuple[Check, ...]
     suggestion: str
@@ -408,9 +408,17 @@ def diagnose(
         lines = moving_lines(data.segmentations)
 
         def examined(data: Data) -> Diagnosis:
-            about = {"findings": (*findings, *unusual), "level": level, "naming": not spoiling}
             examination = Examination.of(
-                calibration, data, noise_of(static), held, names, tuple(notes), tuple(known), **about
+                calibration,
+                data,
+                noise_of(static),
+                held,
+                names,
+                tuple(notes),
+                tuple(known),
+                findings=(*findings, *unusual),
+                level=level,
+                naming=not spoiling,
             )
             return examine(examination)
 

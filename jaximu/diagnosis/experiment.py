@@ -19,7 +19,7 @@ from jaximu.diagnosis.shapes import imitated_shapes, shapes_without_cause
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.fitting import Linear, Prior, effect_numbers, fit, linearise
 from jaximu.estimation.problem import Name
-from jaximu.estimation.rows import Fold, Rows
+from jaximu.estimation.rows import Fold, Rows, Sizes
 from jaximu.estimation.track import added
 from jaximu.ground.array_types import Array, BoolArray, FloatArray
 from jaximu.ground.document import Json
@@ -62,7 +62,7 @@ class State:
     evidence: Evidence
     conditions: FloatArray
     weights: FloatArray
-    limits: dict[str, tuple[float, str]]
+    limits: Sizes
     blind: dict[str, str]
     linear: Linear
     prior: Prior | None = None
@@ -300,7 +300,7 @@ class Experiment(Data):
                 most[name] = max(most[name], float(np.max(values)))
         return most
 
-    def rms(self, imu: Imu, linear: Linear) -> dict[str, tuple[float, str]]:
+    def rms(self, imu: Imu, linear: Linear) -> Sizes:
         """Return the rms of each kind of residual, with its unit, as a calibration has it."""
         return self.data.rms(imu, linear.details, linear.conditions)
 
@@ -453,9 +453,9 @@ class Experiment(Data):
         return [replace(block, columns=part) for block, part in zip(blocks, parts, strict=True)], refused
 
 
-def _limits(evidence: Evidence, imu: Imu) -> dict[str, tuple[float, str]]:
+def _limits(evidence: Evidence, imu: Imu) -> Sizes:
     """Return each effect's detection limit, wherever on its grid it is, and its unit; infinite if it is blind."""
-    limits: dict[str, tuple[float, str]] = {}
+    limits: Sizes = {}
     triads = imu.triads()
     places: dict[str, list[int]] = {}
     for k, block in enumerate(evidence.blocks):

@@ -9,6 +9,7 @@ import numpy as np
 from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import State
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.vectors import sigmas_of
 
 _NOTHING = 0.05
@@ -60,4 +61,4 @@ def _shifts(state: State, name: str, limit: float) -> dict[str, float]:
 
 def _spread(shift: FloatArray) -> FloatArray:
     """Return the root mean square (p,) over coefficient vectors of length one and random direction."""
-    return np.sqrt(np.mean(shift**2, axis=1))
+    return rms(shift, axis=1)

@@ -14,7 +14,7 @@ from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.selection import select
 from jaximu.estimation.leave_out import LeftOut, leave_out, off
 from jaximu.estimation.problem import Name
-from jaximu.estimation.rows import Rows
+from jaximu.estimation.rows import Rows, Sizes
 from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.document import Json
@@ -37,7 +37,7 @@ class Prediction:
     the parameters' uncertainty included. log_likelihood: of them, nats.
     """
 
-    rms: dict[str, tuple[float, str]]
+    rms: Sizes
     chi_squared: float
     count: int
     log_likelihood: float

@@ -20,7 +20,7 @@ from jaximu.estimation.fitting import linearise
 from jaximu.estimation.leave_out import leave_out
 from jaximu.estimation.rows import ResidualKind, Rows, Sizes
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.distributions import chi2_sf
+from jaximu.ground.distributions import chi2_sf, rms
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
 from jaximu.ground.vectors import column_lengths, lengths_of, submatrix
@@ -270,7 +270,7 @@ def _heading_off(triads, magnetic: Json) -> float | None:
     output = body @ np.asarray(new.gain).T + np.asarray(new.bias)
     corrected = np.linalg.solve(np.asarray(old.gain), (output - np.asarray(old.bias)).T).T
     off = np.angle((corrected[:, 0] + 1j * corrected[:, 1]) / (body[:, 0] + 1j * body[:, 1]))
-    return float(np.degrees(np.sqrt(np.mean(off**2))))
+    return float(np.degrees(rms(off)))
 
 
 def _askable(windows: FieldWindows, triad) -> tuple[list[type[Effect]], dict[str, str]]:

@@ -21,6 +21,7 @@ from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.learned import left_out_likelihood
 from jaximu.diagnosis.noise import usual_noise
 from jaximu.diagnosis.selection import criterion
+from jaximu.estimation.rows import Sizes
 from jaximu.ground.document import Document, Json
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
@@ -54,7 +55,7 @@ class HandHeldThermal(Result, Document, page="thermal_hand_held"):
     experiment: Experiment
     range: tuple[float, float]
     steps: tuple[tuple[str, float, float], ...]
-    limits: dict[str, tuple[float, str]]
+    limits: Sizes
     undetermined: dict[str, str]
     notes: tuple[str, ...] = ()
     software: dict[str, str] = field(default_factory=lambda: {"name": "jaximu", "version": __version__})

@@ -219,7 +219,9 @@ class Validity(Result, Document, page="validity"):
                 f"The calibration is missing an effect ({ratio}): {causes}; {what}. Diagnose a recording and keep "
                 "the extended calibration."
             )
-        words = [_shift_words(shift) for shift in self.moved[:3]]
+        words = [
+            f"{shift.words} moved by {shift.output or shift.amount} ({abs(shift.z):.1f} σ)" for shift in self.moved[:3]
+        ]
         words = words or [
             f"{cause.title} moved{self._alone(cause)}" for cause in self.causes if cause.scope == "parameter"
         ]
@@ -271,7 +273,3 @@ class Validity(Result, Document, page="validity"):
             "calibration": self.calibration.data,
             "software": SOFTWARE,
         }
-
-
-def _shift_words(shift: Shift) -> str:
-    return f"{shift.words} moved by {shift.output or shift.amount} ({abs(shift.z):.1f} σ)"

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
+from jaximu.ground.distributions import rms
 
 Sizes = dict[str, tuple[float, str]]
 """Of errors, by name: a size and its unit."""
@@ -108,7 +109,7 @@ class Rows:
     def rms(self, conditions: FloatArray) -> Sizes:
         """Return the rms of the errors of each kind that is there, with its unit."""
         return {
-            kind.name: (float(np.sqrt(np.mean(errors**2))), kind.unit)
+            kind.name: (float(rms(errors)), kind.unit)
             for kind, errors in zip(self.kinds, self.errors(conditions), strict=True)
             if len(errors)
         }

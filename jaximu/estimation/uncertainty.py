@@ -1,6 +1,6 @@
 """Covariance, rank and weak directions of a solved problem, and what to record against them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -183,14 +183,18 @@ def _in_si(
 
 def _strongest(effect: FloatArray) -> str:
     """The body directions of `_GRID` at which an effect is largest, three at most."""
-    return "; or ".join(_pointing(u) for u in _GRID[effect >= 0.9 * effect.max()][:3])
+    return "; or ".join(direction_words(u) for u in _GRID[effect >= 0.9 * effect.max()][:3])
 
 
-def _pointing(direction: FloatArray) -> str:
-    parts = [
-        ("+" if value > 0 else "−") + axis for axis, value in zip("xyz", direction, strict=True) if abs(value) > 0.1
-    ]
-    return parts[0] if len(parts) == 1 else f"halfway between {listed(parts)}"
+def direction_words(vector: FloatArray) -> str:
+    """Put a direction into words, by its axes longer than a third of it."""
+    axes = signed_axes(vector)
+    return axes[0] if len(axes) == 1 else f"between {listed(axes)}"
+
+
+def signed_axes(vector: Iterable[float]) -> list[str]:
+    """Return the axes, "+x" or "−x", along which a unit vector has more than a third of its length."""
+    return [("+" if value > 0 else "−") + axis for axis, value in zip("xyz", vector, strict=True) if abs(value) > 0.33]
 
 
 _LAGS = 15

@@ -4,9 +4,9 @@ import numpy as np
 import scipy
 
 
-def rms(values) -> float:
-    """Return the root mean square of numbers of any shape."""
-    return float(np.sqrt(np.square(values).mean()))
+def rms(values, axis=None):
+    """Return the root mean square of numbers of any shape, over all of them or an axis."""
+    return np.sqrt(np.square(values).mean(axis=axis))
 
 
 def robust_sigma(errors, axis=None):

@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.ground.vectors import dot_rows, lengths_of
 from jaximu.mistakes.base import Samples, Sensor
@@ -100,7 +101,7 @@ def _dead_rate(samples: Samples) -> Iterator[Finding]:
     sensor, blocks = samples.gyroscope, samples.turning
     if sensor is None or blocks is None:
         return
-    moved = np.sqrt(np.mean((sensor.values - np.median(sensor.values, axis=0)) ** 2, axis=0))
+    moved = rms(sensor.values - np.median(sensor.values, axis=0), axis=0)
     axis = np.argmin(moved)
     others = np.min(np.delete(moved, axis))
     if others < 0.05 or moved[axis] > 0.02 * others or abs(np.median(sensor.values[:, axis])) > _NO_BIAS:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from jaximu.ground.distributions import rms
 from jaximu.mistakes.base import Samples, Sensor
 from jaximu.recordings.finding import Finding, Rows
 
@@ -57,7 +58,7 @@ def interpolated_at(sensor: Sensor) -> Rows | None:
     if any(step is not None for step in sensor.coarse):
         return None
     bend = np.abs(np.diff(sensor.values, n=2, axis=0))
-    scale = np.sqrt(np.mean(bend**2, axis=0))
+    scale = rms(bend, axis=0)
     if not np.all(scale > 1e-12 * np.maximum(np.max(np.abs(sensor.values), axis=0), 1e-300)):
         return None
     bent = (bend > np.maximum(1.01 * np.minimum(sensor.step, 0.1 * scale), 1e-3 * scale)).any(axis=1)

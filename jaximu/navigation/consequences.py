@@ -25,6 +25,7 @@ from jaximu.calibration import Calibration
 from jaximu.data.preintegration import increments
 from jaximu.estimation.problem import Name, names_of
 from jaximu.ground.array_types import BoolArray, FloatArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.page import Result
@@ -85,7 +86,7 @@ class MonteCarlo:
     @property
     def sigma(self) -> FloatArray:
         """Root mean square (T, 9) over the draws."""
-        return np.sqrt(np.mean(self.errors**2, axis=0))
+        return rms(self.errors, axis=0)
 
 
 @dataclass(frozen=True, repr=False, eq=False)

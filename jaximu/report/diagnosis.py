@@ -593,7 +593,7 @@ def _allan(experiment: Experiment, name: str) -> tuple[FloatArray, FloatArray, F
     """Averaging times (k,), s, Allan deviation of a triad over its longest pose, root mean square of axes; interval."""
     parts, rate = experiment.still_parts(name)
     curve = deviation(max(parts, key=len).T, rate)
-    value = np.sqrt(np.mean(curve.value**2, axis=0))
+    value = rms(curve.value, axis=0)
     # three axes, taken as independent and alike, know their mean √3 times as well as each its own
     known = (curve.value > 0).all(axis=0)  # output may not change at all
     low, high = (

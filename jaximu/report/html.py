@@ -87,10 +87,6 @@ def _inline(text: str) -> Markup:
     return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(text))).replace("\n", "<br>"))
 
 
-def _anchor(title: str) -> str:
-    return re.sub(r"\W+", "-", title.lower()).strip("-")
-
-
 def _kind_of_cell(text: str) -> Markup:
     """Return the attribute of a cell that is a number, and stays on one line, or a long word, which is broken."""
     if max(map(len, text.split()), default=0) > _LONG_WORD:
@@ -140,7 +136,12 @@ def environment() -> jinja2.Environment:
         "script": script,
         "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     }
-    made.filters |= {"inline": _inline, "sentence": sentence, "kind_of_cell": _kind_of_cell, "anchor": _anchor}
+    made.filters |= {
+        "inline": _inline,
+        "sentence": sentence,
+        "kind_of_cell": _kind_of_cell,
+        "anchor": lambda title: re.sub(r"\W+", "-", title.lower()).strip("-"),
+    }
     return made
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaximu.calibration import Calibration, Heading
 from jaximu.calibration.magnetometer import hard_iron
 from jaximu.data.field import MagneticField
+from jaximu.estimation.uncertainty import signed_axes
 from jaximu.ground.document import Json
 from jaximu.ground.page import Page, Picture, Statement
 from jaximu.ground.quantities import Z95, number, sentence
@@ -109,16 +110,10 @@ def next_words(plan: Json) -> str:
     now, then = (number(plan[key], 2) for key in ("heading_now", "heading_then"))
     if plan["heading_then"] >= _PAYS * plan["heading_now"]:
         return f"more orientations buy little: six would take a level heading from {now}° to {then}° only."
-    listed = ", ".join(dict.fromkeys(_along(direction) for direction in plan["directions"]))
+    listed = ", ".join(dict.fromkeys("".join(signed_axes(direction)) for direction in plan["directions"]))
     return (
         f"hold the unit so that the field points along its {listed}: {len(plan['directions'])} such directions, a "
         f"second each, take what is uncertain of a level heading from {now}° to {then}°."
-    )
-
-
-def _along(direction: Sequence[float]) -> str:
-    return "".join(
-        ("+" if part > 0 else "−") + axis for part, axis in zip(direction, "xyz", strict=True) if abs(part) > 0.4
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from datetime import UTC, datetime
-from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
@@ -109,25 +108,24 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
 
     undetermined = f"{name} gain" in calibration.from_data_sheet
 
-    def scale_words(i: int) -> str:
-        if undetermined:
-            return _GIVEN
-        if nominal is None and counts:
-            return ""
-        start = 1.0 if nominal is None else np.asarray(nominal.gain)[i, i]
-        if exchanged[i]:
-            return _EXCHANGED
-        change = with_interval(100 * (scale[i] / start - 1), 100 * gain_sigma[i, i] / abs(start), "%", sign=True)
-        origin = "nominal" if _started_nominal(calibration, name) else "where the fit started,"
-        return f"{change} from {origin}" + (f" {plain(start)}" if counts else "")
-
-    def misalignment_words(i: int, j: int) -> str:
+    def gain_words(i: int, j: int) -> str:
         if undetermined:
             return _GIVEN
         if not (gain[i, j] or gain_sigma[i, j]):
             return "by convention: fixes the body frame"
         if exchanged[i]:
             return _EXCHANGED
+        return scale_words(i) if i == j else misalignment_words(i, j)
+
+    def scale_words(i: int) -> str:
+        if nominal is None and counts:
+            return ""
+        start = 1.0 if nominal is None else np.asarray(nominal.gain)[i, i]
+        change = with_interval(100 * (scale[i] / start - 1), 100 * gain_sigma[i, i] / abs(start), "%", sign=True)
+        origin = "nominal" if _started_nominal(calibration, name) else "where the fit started,"
+        return f"{change} from {origin}" + (f" {plain(start)}" if counts else "")
+
+    def misalignment_words(i: int, j: int) -> str:
         tilt = gain[i, j] / scale[i]
         sigma = _ratio_sigma(calibration, name, gain, i, j)
         in_mrad = with_interval(1e3 * tilt, 1e3 * sigma, "mrad", sign=True)
@@ -146,20 +144,22 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
     def row(part: str, axes: tuple[int, ...], meaning: str) -> tuple[str, str, str, str]:
         parameter = Name(name, part, axes)
         value, sigma = (matrix[axes] for matrix in fitted[part])
-        fixed = meaning.startswith("by convention")
-        shown = "0" if fixed else with_interval(value, sigma, per) if part == "gain" else with_interval(value, sigma)
+        of_part = per if part == "gain" else ""
+        shown = "0" if meaning.startswith("by convention") else with_interval(value, sigma, of_part)
         if (not counts or part == "gain") and 0 < abs(value) <= Z95 * sigma:
             meaning = f"{meaning}; not different from zero".removeprefix("; ")
         if parameter in calibration.open_numbers:
-            shown = with_interval(value, 0.0, per if part == "gain" else "")
+            shown = with_interval(value, 0.0, of_part)
             meaning = "not determined"
         words = describe(parameter).removeprefix(f"{name} ") + " *" * (parameter in weak)
         # a bias as it is put out: what the equation takes
         return short_name(parameter), words, shown + f" {unit}" * (part == "bias"), meaning
 
     return [
-        *(row("gain", (i, i), scale_words(i)) for i in range(3)),
-        *(row("gain", axes, misalignment_words(*axes)) for axes in permutations(range(3), 2)),
+        *(
+            row("gain", axes, gain_words(*axes))
+            for axes in sorted(np.ndindex(3, 3), key=lambda axes: axes[0] != axes[1])
+        ),
         *(row("bias", (i,), bias_words(i)) for i in range(3)),
     ]
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaximu.acceptance.epochs import over_temperature
 from jaximu.calibration import Calibration
 from jaximu.estimation.projection import OutputUncertainty
+from jaximu.estimation.uncertainty import direction_words
 from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.page import Part, Picture, Statement
 from jaximu.ground.quantities import Z95, listed, number, readable, size
@@ -19,7 +20,6 @@ from jaximu.model.stimulus import Stimulus
 from jaximu.report import figures
 from jaximu.report.evidence import evidence
 from jaximu.report.export import Range
-from jaximu.report.words import direction_words
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

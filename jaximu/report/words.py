@@ -10,9 +10,10 @@ import numpy as np
 
 from jaximu.calibration import Calibration
 from jaximu.estimation.problem import Name
+from jaximu.estimation.uncertainty import direction_words
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.page import Statement
-from jaximu.ground.quantities import Z95, listed, number, sentence, size
+from jaximu.ground.quantities import Z95, number, sentence, size
 from jaximu.ground.vectors import sigmas_of
 from jaximu.report.evidence import PoseAndTurnErrors, largest_gap
 
@@ -223,9 +224,3 @@ def limits(calibration: Calibration, errors: PoseAndTurnErrors | None = None) ->
         if effects
         else f"Effects beyond scale, misalignment and bias were not tested ({missing}).",
     )
-
-
-def direction_words(vector: np.ndarray) -> str:
-    """Put a direction into words, by its axes longer than a third of it."""
-    parts = [("+" if value > 0 else "−") + axis for axis, value in zip("xyz", vector, strict=True) if abs(value) > 0.33]
-    return parts[0] if len(parts) == 1 else f"between {listed(parts)}"

@@ -22,7 +22,11 @@ def read(data: bytes, source: Source) -> LogTable:
     """The table in a Parquet file; of nested columns only lists of three numbers count. A row's number is 1-based."""
     schema = pq.read_schema(pa.BufferReader(data))
     flat = [field for field in schema if not pa.types.is_nested(field.type)]
-    texts = [field.name for field in flat if not _numeric(field.type)]  # each once, not once a row
+    texts = [  # each once, not once a row
+        field.name
+        for field in flat
+        if not (pa.types.is_integer(field.type) or pa.types.is_floating(field.type) or pa.types.is_temporal(field.type))
+    ]
     file = pq.ParquetFile(pa.BufferReader(data), read_dictionary=texts)
     rows = file.metadata.num_rows
     unpacking = Unpacking(source, len(data))
@@ -44,7 +48,3 @@ def read(data: bytes, source: Source) -> LogTable:
     vectors = vectors_apart(file.read(nested)) if nested else pa.table({})
     columns += map(from_arrow, vectors.columns)
     return LogTable(source, named_with_units([*flat, *vectors.schema]), tuple(columns), axes=mapped_axes(schema))
-
-
-def _numeric(kind: pa.DataType) -> bool:
-    return pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_temporal(kind)
