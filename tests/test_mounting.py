@@ -36,12 +36,6 @@ def test_a_mounting_has_what_the_effects_of_a_unit_say(unit):
     assert not np.any(jnp.hstack(Mounting.of(Imu.nominal())))
 
 
-def test_the_clocks_scale_is_an_effect_of_long_recordings_alone():
-    brief, long = (Mounting.effects(duration, rotation=0.0, delay=1.0) for duration in (299.0, 301.0))
-    assert [effect.name for effect in brief] == ["setup.reference_rotation", "setup.reference_delay"]
-    assert [effect.name for effect in long] == [*(effect.name for effect in brief), "setup.clock_scale"]
-
-
 def test_stamps_are_put_on_the_logs_clock_and_back(unit):
     """At each time of the log the effects look the reference up where `on_reference` says."""
     mounting, times = Mounting.of(unit), np.linspace(0.0, 10.0, 101)

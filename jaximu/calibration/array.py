@@ -196,7 +196,7 @@ def _pair(
     """Return a unit of the array, and its errors (S, 6), m/s² and rad/s, less the first's, in the first's axes."""
     back = _rotation(shared, corrected, delay)
     turned = Rotation.from_matrix(back)
-    setup = Mounting.effects(np.ptp(shared.moving), rotation=turned.as_rotvec(), delay=0.0, lever_arm=0.0)
+    setup = Mounting.effects(rotation=turned.as_rotvec(), delay=0.0, lever_arm=0.0, clock_scale=0.0)
     start = on_host(calibration.imu.with_effects(*setup))
     noise = _noise(recording, shared, start, back, delay)
     stations = [

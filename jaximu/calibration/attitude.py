@@ -208,9 +208,7 @@ def _begin(recording: Recording, start: _Start, effects: Sequence[Effect], unit:
     """Return the unit, the data sheet's if None, under the reference as it was coarsely aligned."""
     turned = scipy.spatial.transform.Rotation.from_matrix(start.matrix.T).as_rotvec()
     arm = {} if start.attitude.velocities() is None else {"lever_arm": 0.0}
-    setup = Mounting.effects(
-        np.ptp(recording.accelerometer.time), rotation=turned, delay=start.delay, tilt=0.0, filter_variance=0.0, **arm
-    )
+    setup = Mounting.effects(rotation=turned, delay=start.delay, tilt=0.0, filter_variance=0.0, clock_scale=0.0, **arm)
     imu = as_stated(recording) if unit is None else unit.transferable()
     if unit is None and imu.gyroscope is not None:
         imu = replace(imu, gyroscope=replace(imu.gyroscope, gain=np.asarray(imu.gyroscope.gain) @ start.arranged))

@@ -33,8 +33,6 @@ MOUNTING_EFFECTS = (
 )
 """Effects that say how what measures from outside is mounted, in the order of the fields of `Mounting`; the unit's path
 is the same without them."""
-_LONG = 300.0
-"""Seconds from which on the drift of two clocks against each other shows."""
 
 
 class Mounting(NamedTuple):
@@ -60,9 +58,8 @@ class Mounting(NamedTuple):
         return ravel_pytree(cls())[1](numbers)
 
     @staticmethod
-    def effects(duration: float = 0.0, **start: ArrayLike) -> tuple[Effect, ...]:
-        """Return the effects of these fields, from start values; over a long `duration` (s) the clocks' too."""
-        start |= {"clock_scale": 0.0} if duration > _LONG else {}
+    def effects(**start: ArrayLike) -> tuple[Effect, ...]:
+        """Return the effects of these fields, from start values."""
         kinds = zip(Mounting._fields, MOUNTING_EFFECTS, strict=True)
         return tuple(kind.make(start[name]) for name, kind in kinds if name in start)
 

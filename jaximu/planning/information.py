@@ -285,7 +285,7 @@ def robot_information(
     samples = jnp.clip(
         _SPLIT * jnp.arange(count)[:, None] + jnp.arange(-_BESIDE, _SPLIT + 1 + _BESIDE), 0, _SPLIT * count
     )
-    effects = Mounting.effects(rotation=0.0, delay=0.0, tilt=0.0, filter_variance=0.0)
+    effects = Mounting.effects(rotation=0.0, delay=0.0, tilt=0.0, filter_variance=0.0, clock_scale=0.0)
     sizes, effects_of = ravel_pytree([effect.typical_sizes(1.0) for effect in effects])
     known = len(parameters.names)
 

@@ -8,10 +8,10 @@ from functools import partial
 import numpy as np
 
 from jaximu.calibration import Calibration
+from jaximu.calibration.attitude import fitted_mounting
 from jaximu.data.attitude import AgainstAttitude
 from jaximu.ground.page import Page, Picture, Statement
-from jaximu.ground.quantities import Z95, sentence, unit_text
-from jaximu.model.mounting import Mounting
+from jaximu.ground.quantities import Z95, sentence, unit_text, with_interval
 from jaximu.report.calibration import calibration_page
 from jaximu.report.canvas import Figure
 from jaximu.report.figures import AFTER, BEFORE, dressed, legend, stacked, zero_line
@@ -40,12 +40,12 @@ def mounting_words(calibration: Calibration) -> Iterator[str]:
     delay = 1e3 * offset["value"]
     yield from [
         f"The reference's stamps are {abs(delay):.3g} ± {1.96e3 * offset['sigma']:.2g} ms "
-        f"{'late' if delay > 0 else 'early'}.",
+        f"{'late' if delay > 0 else 'early'} where the log begins.",
         f"The unit is turned by {angle:.3g}° relative to the body of the reference.",
     ]
-    drift = 1e6 * (alignment["clock_scale"] - 1)
-    if drift:
-        yield (f"The log's clock runs {abs(drift):.3g} ppm {'fast' if drift > 0 else 'slow'} against the reference's.")
+    mounting, covariance = fitted_mounting(calibration.imu, calibration.names, calibration.covariance)
+    drift = with_interval(1e6 * abs(mounting.clock_scale), 1e6 * np.sqrt(covariance.clock_scale[0, 0]), "ppm")
+    yield f"The log's clock runs {drift} {'fast' if mounting.clock_scale > 0 else 'slow'} against the reference's."
     wide = alignment["filter"]["variance"]
     sigma = alignment["filter"]["sigma"]
     most, least = (1e3 * np.sqrt(max(abs(wide) + times * Z95 * sigma, 0.0)) for times in (1, -1))
@@ -63,7 +63,7 @@ def mounting_words(calibration: Calibration) -> Iterator[str]:
             f"{1e3 * value:.3g} ± {1.96e3 * sigma:.2g}" for value, sigma in zip(arm["value"], arm["sigma"], strict=True)
         )
         yield f"The unit lies {places} mm (95 %) from the point that is tracked, along the reference's x, y, z."
-    yield f"The reference's vertical is off by {np.degrees(np.linalg.norm(Mounting.of(calibration.imu).tilt)):.2g}°."
+    yield f"The reference's vertical is off by {np.degrees(np.linalg.norm(mounting.tilt)):.2g}°."
 
 
 def share_words(calibration: Calibration) -> list[str]:
