@@ -31,6 +31,7 @@ CASES = {
        for late in (0, 5, -5, 200, -200)},
     "tracker 10 Hz, 200 ms early": {"tracked": 10.0, "delay": -0.2},
     "tracker 500 Hz, ten times its noise": {"tracked": 500.0, "attitude_noise": 3e-3},
+    "a minute, log's clock 50 ppm fast": {"drift": 5e-5},
     "six minutes, log's clock 100 ppm fast": {"duration": 400.0, "drift": 1e-4},
     "tracker's filter: a lag of 20 ms": {"lag": 0.02},
     "tracker's filter: a lag of 50 ms": {"lag": 0.05},
