@@ -118,6 +118,8 @@ async def compared(paths: list[Path], write: bool) -> bool:
     from nbclient.exceptions import CellExecutionError
 
     free = asyncio.Semaphore(os.cpu_count() or 1)
+    # kernels fill the cores: threads of NumPy's beside them wait for one another, and wait busily
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     runs, fine = [asyncio.create_task(execute(path, free)) for path in paths], True
     for path, ended in zip(paths, runs, strict=True):
         try:
