@@ -106,10 +106,10 @@ def with_interval(value: float, sigma: float, unit: str = "", sign: bool = False
     if not half > 0:
         return joined(number(value, 6), printed)
     digits, plus = max(0, 1 - math.floor(math.log10(half))), "+" if sign else ""
-    power = math.floor(math.log10(max(abs(value), half)))
-    if power >= -4 and digits < 8:
+    if digits < 8:
         text = f"{value:{plus}z.{digits}f} ± {half:.{digits}f}"  # z: no minus before a zero
     else:
+        power = math.floor(math.log10(max(abs(value), half)))
         text = f"({value * 10.0**-power:{plus}z.{digits + power}f} ± {half * 10.0**-power:.{digits + power}f})"
         text += f"·10{raised(power)}"
     return joined(text.replace("-", "−"), printed)
