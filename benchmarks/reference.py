@@ -53,12 +53,12 @@ def cut(recording, start, stop):
 
 
 def open_loop(recording, attitude, imu):
-    """Angle (deg) by which the integrated attitude is off after all of the reference, mounting and delay known."""
+    """Angle (deg) by which the integrated attitude is off after all of the reference, mounting and clocks known."""
     gyroscope = recording.gyroscope
     setup = {each.name: np.asarray(each.coefficients) for each in imu.setup}
-    delay = setup["setup.reference_delay"][0]
+    delay, scale = setup["setup.reference_delay"][0], 1 + setup["setup.clock_scale"][0]
     mounting = scipy.spatial.transform.Rotation.from_rotvec(setup["setup.reference_rotation"])
-    stamps = attitude.time + (attitude.start - float(recording.start)) - delay
+    stamps = (attitude.time + (attitude.start - float(recording.start)) - delay) * scale
     inside = np.flatnonzero((stamps > gyroscope.time[1]) & (stamps < gyroscope.time[-2]))
     first, last = inside[0], inside[-1]
     rate = (gyroscope.values - np.asarray(imu.gyroscope.bias)) @ np.linalg.inv(np.asarray(imu.gyroscope.gain)).T
@@ -66,7 +66,7 @@ def open_loop(recording, attitude, imu):
     held = np.maximum(np.minimum(edges[1:], stamps[last]) - np.maximum(edges[:-1], stamps[first]), 0.0)
     used = held > 0
     turned = scipy.spatial.transform.Rotation.identity()
-    steps = scipy.spatial.transform.Rotation.from_rotvec(rate[used] * held[used, None])
+    steps = scipy.spatial.transform.Rotation.from_rotvec(rate[used] * held[used, None] / scale)
     quaternion = np.array([0.0, 0.0, 0.0, 1.0])
     for x, y, z, w in steps.as_quat():  # the plain product, sample by sample
         a, b, c, d = quaternion
