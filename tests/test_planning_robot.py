@@ -92,7 +92,7 @@ def design_of(proposal) -> Design:
     return Design(found, np.zeros((0, 4)), np.zeros(0))
 
 
-@pytest.mark.slow  # benchmarks/results/planning.md has them by hand
+@pytest.mark.slow  # benchmarks/results/planning.md: predicted and measured, by hand
 def test_errors_are_those_predicted(proposal):
     """χ² of 21 numbers of each unit, their errors as the reference's own calibration leaves them."""
     question, _ = question_of(known(), ROBOT, "D", None, POSES)

@@ -36,16 +36,19 @@ def mounting_words(calibration: Calibration) -> Iterator[str]:
     alignment = calibration.reference
     assert alignment is not None
     offset = alignment["time_offset"]
-    angle = np.degrees(2 * np.arccos(min(1.0, abs(alignment["rotation"][0]))))
     delay = 1e3 * offset["value"]
     yield from [
         f"The reference's stamps are {abs(delay):.3g} ± {1.96e3 * offset['sigma']:.2g} ms "
         f"{'late' if delay > 0 else 'early'} where the log begins.",
-        f"The unit is turned by {angle:.3g}° relative to the body of the reference.",
+        f"The unit is turned by {np.degrees(2 * np.arccos(min(1.0, abs(alignment['rotation'][0])))):.3g}° relative to "
+        "the body of the reference.",
     ]
     mounting, covariance = fitted_mounting(calibration.imu, calibration.names, calibration.covariance)
-    drift = with_interval(1e6 * abs(mounting.clock_scale), 1e6 * np.sqrt(covariance.clock_scale[0, 0]), "ppm")
-    yield f"The log's clock runs {drift} {'fast' if mounting.clock_scale > 0 else 'slow'} against the reference's."
+    if sigma := np.sqrt(covariance.clock_scale[0, 0]):
+        yield (
+            f"The log's clock runs {with_interval(1e6 * abs(mounting.clock_scale), 1e6 * sigma, 'ppm')} "
+            f"{'fast' if mounting.clock_scale > 0 else 'slow'} against the reference's."
+        )
     wide = alignment["filter"]["variance"]
     sigma = alignment["filter"]["sigma"]
     most, least = (1e3 * np.sqrt(max(abs(wide) + times * Z95 * sigma, 0.0)) for times in (1, -1))
