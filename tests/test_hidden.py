@@ -1,9 +1,12 @@
 """What a cause at its detection limit would do: against recordings in which it is hidden, of the same noise."""
 
+import json
+
 import numpy as np
 import pytest
 
 import jaximu
+from jaximu.cli import main
 from jaximu.diagnosis.diagnosis import recorded_by_hand
 from jaximu.diagnosis.experiment import Experiment
 from jaximu.diagnosis.hidden import hidden_causes, shift_by
@@ -24,6 +27,13 @@ def recording(*effects):
 @pytest.fixture(scope="module")
 def sound():
     return fitted(recording())
+
+
+LIMITS = """
+[limits]
+"gyroscope.bias" = "3 deg/s"
+[nominal]
+"""
 
 
 def fitted(made):
@@ -58,3 +68,40 @@ def test_the_worst_comes_first_and_each_number_is_named(sound):
     assert {cause.name for cause in causes} == set(sound.limits)
     names = {str(name) for name in sound.names}
     assert all(set(cause.shift) <= names for cause in causes)
+
+
+def test_intervals_that_allow_for_it_hold(sound):
+    """Of a unit that hides a cubic of the size of its limit in each sensor: some of the plain intervals are far off."""
+    shifts = [cause.shift for cause in hidden_causes(sound)]
+    sizes = {name: sound.limits[name][0] / np.sqrt(3) for name in ("accel.cubic", "gyro.cubic")}
+    made = recording(*(CATALOGUE[name](size * np.ones(3)) for name, size in sizes.items()))
+    plain = jaximu.calibrate(made, GRAVITY, static=NOISE)
+    truth = draw_imu(3).triads()
+    errors = [
+        np.asarray(getattr(plain.triads()[name.owner], name.part) - getattr(truth[name.owner], name.part))[name.axes]
+        for name in plain.names
+    ]
+    over, wider = (
+        np.abs(errors) / np.sqrt(np.diagonal(each.covariance)) for each in (plain, plain.allowing_for(shifts))
+    )
+    assert over.max() > 3 and wider.max() < 3
+
+
+def test_accept_allows_for_what_the_recording_cannot_see(sound, tmp_path, capsys):
+    calibration = jaximu.calibrate(recording(), GRAVITY, static=NOISE)
+    file, limits, diagnosis = (str(tmp_path / name) for name in ("calibration.json", "limits.toml", "diagnosis.json"))
+    calibration.save(file)
+    (tmp_path / "limits.toml").write_text(LIMITS, encoding="utf-8")
+    document = {"schema": "jaximu.diagnosis/1", "data": calibration.data}
+    document["hidden"] = [{"shift": cause.shift | {"gyroscope.bias[1]": 1e6}} for cause in hidden_causes(sound)]
+    (tmp_path / "diagnosis.json").write_text(json.dumps(document), encoding="utf-8")
+    assert main(["accept", file, "--limits", limits]) == 0
+    assert main(["accept", file, "--limits", limits, "--diagnosis", diagnosis]) == 4
+    assert "each as large as its detection limit" in " ".join(capsys.readouterr().out.split())
+    other = document | {"data": calibration.data | {"files": [{"file": "other.csv"}]}}
+    (tmp_path / "diagnosis.json").write_text(json.dumps(other), encoding="utf-8")
+    assert main(["accept", file, "--limits", limits, "--diagnosis", diagnosis]) == 2
+    assert "is the diagnosis of other.csv" in " ".join(capsys.readouterr().err.split())
+    del document["hidden"]
+    (tmp_path / "diagnosis.json").write_text(json.dumps(document), encoding="utf-8")
+    assert main(["accept", file, "--limits", limits, "--diagnosis", diagnosis]) == 2

@@ -176,6 +176,18 @@ class Calibration(Result, Document, page="calibration"):
         names = tuple(self.names[row] for row in rows)
         return replace(self, names=names, covariance=submatrix(self.covariance, rows), **changes)
 
+    def allowing_for(self, shifts: Iterable[Mapping[str, float]]) -> Calibration:
+        """Return the same whose numbers are uncertain by what its recording cannot see, too.
+
+        **Arguments:** `shifts`: what each cause would do at its detection limit, by the number's name in its standard
+        deviations, such as `cause.shift` of `Diagnosis.hidden`. Each number takes the largest as a further standard
+        deviation, independent of all others.
+        """
+        causes = list(shifts)
+        largest = [max((shift.get(str(name), 0.0) for shift in causes), default=0.0) for name in self.names]
+        hidden = np.diag(np.diagonal(self.covariance) * np.square(largest))
+        return replace(self, covariance=self.covariance + hidden)
+
     def _of_data_sheet(self) -> tuple[Name, ...]:
         """Return the numbers of gains and biases that no recording determined; zeros that fix a frame are none."""
         lower = {Name(name, "gain", (i, j)) for name in self.triads() for i in range(3) for j in range(i + 1)}

@@ -36,6 +36,7 @@ class AcceptCommand:
 
     Examples:
       jaximu accept results/calibration.json --limits limits.toml
+      jaximu accept results/calibration.json --limits limits.toml --diagnosis results/diagnosis.json
       jaximu accept results/calibration.json --limits limits.toml --trace trace.toml -o accepted
       jaximu accept fleet.parquet --limits limits.toml --golden UNIT7 -o line
       jaximu accept results/calibration.json --limits limits.toml --measurements junit.xml
@@ -53,6 +54,7 @@ class AcceptCommand:
     noise: Annotated[Path | None, option("ALLAN.json", "From jaximu allan, for limits of noise and repeatability.")] = (
         None
     )
+    diagnosis: options.DiagnosisFile = None
     trace: Annotated[
         Path | None,
         option("TRACE.toml", "Serial number, operator, references …, beside what a calibration says."),
@@ -86,7 +88,7 @@ class AcceptCommand:
             raise InputError(
                 "name a calibration.json, or a table of jaximu fleet, and its limits: --limits LIMITS.toml."
             )
-        options.require_files(*self.calibrations, self.limits, self.noise, self.trace)
+        options.require_files(*self.calibrations, self.limits, self.noise, self.diagnosis, self.trace)
         if self.measurements is not None:
             from jaximu.acceptance.interchange import check_measurements
 
@@ -116,9 +118,12 @@ class AcceptCommand:
         loaded = [_loaded(path, self.trace) for path in self.calibrations]
         _refuse_doubled(loaded, self.calibrations)
         self.results.prepare()
+        acceptances: list[Acceptance] = []
         with progress("deciding"):
-            pairs = zip(loaded, self.calibrations, strict=True)
-            acceptances = [accept(calibration, limits, known, path) for calibration, path in pairs]
+            for calibration, path in zip(loaded, self.calibrations, strict=True):
+                wider, hidden = options.allowing_for(calibration, self.diagnosis)
+                acceptance = accept(wider, limits, known, path)
+                acceptances.append(replace(acceptance, notes=(*acceptance.notes, *hidden)))
         certificate = not self.without_certificate
         if self.results.output is not None and certificate:
             acceptances = [_with_what_is_missing(acceptance) for acceptance in acceptances]
@@ -140,7 +145,7 @@ class AcceptCommand:
 
     def _line(self, path: Path) -> str:
         """Follow the line that a fleet's table is of; return its verdict."""
-        for name, value in (("--noise", self.noise), ("--trace", self.trace)):
+        for name, value in (("--noise", self.noise), ("--diagnosis", self.diagnosis), ("--trace", self.trace)):
             if value is not None:
                 raise InputError(f"{name} belongs to single calibrations, not to a fleet's table.")
         limits, output = self.limits and limits_of(self.limits, self.rule, self.risk), self.results.output

@@ -35,6 +35,7 @@ class ConsequencesCommand(options.Reads):
     Examples:
       jaximu consequences results/calibration.json
       jaximu consequences results/calibration.json --noise noise/allan.json --path flight.csv -o consequences
+      jaximu consequences results/calibration.json --diagnosis results/diagnosis.json
       jaximu consequences results/calibration.json --against old/calibration.json --duration 60
       jaximu consequences results/calibration.json --path flight.csv --noise noise/allan.json --noise-for vins,gtsam
 
@@ -43,6 +44,7 @@ class ConsequencesCommand(options.Reads):
     calibration: options.CalibrationFile
     path: Annotated[Path | None, option("SPEC|LOG", "The path (default: ten minutes of level driving).")] = None
     noise_file: options.NoiseFile = None
+    diagnosis: options.DiagnosisFile = None
     against: Annotated[Path | None, option("CALIBRATION", "Compare with another calibration of the unit.")] = None
     duration: Annotated[
         float | None, option("S", "Length of the path; default 600 s, of a LOG 60 s, of a SPEC all.")
@@ -78,7 +80,7 @@ class ConsequencesCommand(options.Reads):
         from jaximu.navigation.consequences import consequences
         from jaximu.navigation.trajectory import Place
 
-        model = load_calibration(self.calibration)
+        model, hidden = options.allowing_for(load_calibration(self.calibration), self.diagnosis)
         other = None if self.against is None else load_calibration(self.against)
         noise = None if self.noise_file is None else options.stated_noise(self.noise_file)
         _require_densities(targets, noise or {})
@@ -98,6 +100,7 @@ class ConsequencesCommand(options.Reads):
                 against=other,
                 files=(str(self.calibration), str(self.against)),
             )
+        result = replace(result, notes=(*result.notes, *hidden))
         names = "consequences.json, report.html and pictures"
         if not targets:
             self.results.present(result.summary, names, consequences=result)
@@ -131,7 +134,9 @@ class ConsequencesCommand(options.Reads):
 
     def _targets(self) -> list[str]:
         """Return the estimators asked for. Raises `InputError` where options contradict each other or lack one."""
-        options.require_files(self.calibration, self.path, self.noise_file, self.against, self.reference)
+        options.require_files(
+            self.calibration, self.path, self.noise_file, self.diagnosis, self.against, self.reference
+        )
         if self.duration is not None and not 0 < self.duration < math.inf:
             raise InputError(f"--duration: {self.duration:g} is no number of seconds.")
         if self.draws < 0 or self.seed < 0:

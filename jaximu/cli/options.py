@@ -21,7 +21,7 @@ from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, JaximuError, readable
 from jaximu.ground.gravity import STANDARD, LocalGravity, parse_gravity, wgs84_gravity
 from jaximu.ground.magnetic_field import FieldStrength
-from jaximu.ground.quantities import listed
+from jaximu.ground.quantities import counted, listed
 from jaximu.ground.reexport import later
 from jaximu.ground.units import SENSOR_QUANTITIES
 
@@ -54,6 +54,10 @@ NoiseFile = Annotated[
         "Noise that is known: an allan.json, a Kalibr imu.yaml, or a SPEC as `jaximu simulate` takes it.",
         name="noise",
     ),
+]
+DiagnosisFile = Annotated[
+    Path | None,
+    option("DIAGNOSIS.json", "Also allow for what the recording cannot see: causes as large as their limits."),
 ]
 LossChoice = Annotated[Literal["linear", "huber", "cauchy"], arg(help="Least squares, or robust against outliers.")]
 JsonFlag = Annotated[bool, arg(name="json", help="Print one JSON document on stdout, errors too.")]
@@ -559,6 +563,29 @@ def stated_noise(path: Path) -> SensorNoise:
         name: {process.letter: process.size for process in triad.processes if process.letter}
         for name, triad in read_specification(path).case(0).noise.items()
     }
+
+
+def allowing_for(calibration: Calibration, path: Path | None) -> tuple[Calibration, tuple[str, ...]]:
+    """Return a calibration that allows for what its recording cannot see by a diagnosis of it, and that in words.
+
+    Raises `InputError` for the diagnosis of another recording.
+    """
+    if path is None:
+        return calibration, ()
+    from jaximu.ground.document import damage, read_document
+
+    document = read_document(path, "jaximu.diagnosis/1", "a diagnosis.json of `jaximu diagnose LOG -o DIR`")
+    with damage(path):
+        recorded, causes = document["data"]["files"], document["hidden"]
+        shifts = [cause["shift"] for cause in causes]
+    if recorded != calibration.data.get("files"):
+        others = listed([str(file["file"]) for file in recorded])
+        raise InputError(f"{path} is the diagnosis of {others}, of which this calibration was not made.")
+    words = (
+        f"the uncertainties allow for what the recording cannot see: {counted(len(causes), 'cause')} of {path}, each "
+        "as large as its detection limit."
+    )
+    return calibration.allowing_for(shifts), (words,)
 
 
 def field_strength(text: str | None) -> FieldStrength | None:

@@ -372,7 +372,8 @@ def _limits(diagnosis: Diagnosis) -> Iterator[Part]:
     yield (
         "An effect could be there unnoticed up to its detection limit: the size (coefficients in a random direction) "
         "that its test finds with 90 % power. It would shift the calibrated numbers by as much as the last column "
-        "says, in their standard deviations (σ): the intervals do not include that."
+        "says, in their standard deviations (σ): the intervals do not include that; `jaximu accept` and `jaximu "
+        "consequences` do, with --diagnosis."
     )
     yield Table(
         ("effect", "detection limit", "compared with a plausible size", "would shift most"),
