@@ -327,13 +327,32 @@ def rest_statistics(
     variances = (squares / counts).T / np.square(signal.nominal_scale)
     total = variances.sum(axis=1)
     share = total / max(np.median(total), signal.rounding_variance)  # coarse steps may leave no scatter at all
-    density, _ = _density(signal, [column for column, size in zip(columns, share, strict=True) if size < 2] or columns)
-    factor = np.where(share > 1.5, share, 1.0)
-    duration = counts / signal.rate
+    calm = [column for column, size in zip(columns, share, strict=True) if size < 2] or columns
+    (density, _), sway = _density(signal, calm), np.zeros((3, 3))
     rounding = np.diag(np.square(signal.nominal_scale)) * _rounding_of_means(signal, variances)[:, None, None]
     if turning:
+        density, sway = _without_sway(signal, calm, density)
         rounding = rounding * len(intervals)  # every pose reads the same rate, and rounds it the same way
-    return density, mean.T, density * (factor / duration)[:, None, None] + rounding
+    duration, factor = (counts / signal.rate)[:, None, None], np.where(share > 1.5, share, 1.0)[:, None, None]
+    return density, mean.T, factor * (density / duration + sway / duration**2) + rounding
+
+
+def _without_sway(signal: Signal, columns: Sequence[FloatArray], density: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return a gyroscope's density (3, 3) without the sway of the hand that holds it, and the sway's variance · s².
+
+    A sway keeps its angle within bounds: it is off a mean rate by what its angle differs by from end to end, so that
+    its variance falls with the square of the time, that of white noise with the time. Blocks of a half and a quarter
+    of an interval tell the two apart, where the density falls by more than chance. What sways between the ends of a
+    turn is left to the excess of the turns.
+    """
+    size = int(np.quantile([column.shape[1] for column in columns], 0.2)) // 4
+    (shorter, _), (longer, freedom) = (_of_blocks(signal, columns, count * max(size, 1)) for count in (1, 2))
+    chance = np.sqrt(2 / (3 * max(freedom, 1)))
+    ratio = float((np.diagonal(longer) / np.maximum(np.diagonal(shorter), 1e-300)).mean())  # noise-free: no scatter
+    if size < signal.samples(_SHORTEST) or not freedom or ratio > 1 - _CHANCE * chance:
+        return density, np.zeros((3, 3))
+    white = max(2 - 1 / ratio, chance)  # of the longer ones' density; the rest is half of that of the shorter ones
+    return white * longer, (1 - white) * longer * (2 * size / signal.rate)
 
 
 def _across_gravity(signal: Signal, intervals: FloatArray, force: FloatArray, covariance: FloatArray) -> FloatArray:
