@@ -20,7 +20,7 @@ from jaximu.data.drift import about_biases, with_usual_drift
 from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.choice import with_open_choice
 from jaximu.diagnosis.drift import DriftComponents, drifted, estimate_drift, hands_of
-from jaximu.diagnosis.evidence import FEWEST_DIMENSIONS, LIMIT_POWER, Evidence
+from jaximu.diagnosis.evidence import FEWEST_DIMENSIONS, LIMIT_POWER
 from jaximu.diagnosis.experiment import Experiment, KnownEffect, State
 from jaximu.diagnosis.extension import Extension, Found, extend, settled
 from jaximu.diagnosis.hidden import Hidden, hidden_causes
@@ -28,7 +28,7 @@ from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
 from jaximu.diagnosis.learned import LearnedTerm, learn, left_out_likelihood, promising
 from jaximu.diagnosis.lines import MovingLine, line_findings, moving_lines, swings_of
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise, usual_noise
-from jaximu.diagnosis.selection import Selection, select, shape_of
+from jaximu.diagnosis.selection import Selection, select, shape_of, standing_out
 from jaximu.estimation.data import Data
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.rows import ResidualKind, Sizes
@@ -55,6 +55,8 @@ _OTHER_UNIT = 0.005
 """Difference of gains, in scales, from which two recordings are hardly of one unit."""
 _STEADY = ("bias_ramp", "temperature")
 """Effects that change as slowly as drift does."""
+_ROUNDS = 4
+"""How often drift and hands are estimated at most, beside the effects that stand out the time before."""
 _GUESSED = 10.0
 """Nats that effects must gain, having been chosen on the same data: those that explain a part of a misfit, beyond a
 smooth term, and those with which no error of what was left out is smaller."""
@@ -301,7 +303,8 @@ def extended(calibration: Calibration, experiment: Experiment, state: State, noi
         prior=state.prior,
         excess=np.zeros(len(experiment.coarse)),
     )
-    linear = experiment.linearise(fitted.imu)
+    beyond = np.asarray(fitted.excess) + (0.0 if experiment.excess is None else experiment.excess)
+    linear = replace(experiment, excess=beyond).linearise(fitted.imu)  # the fit's weights know its excess
     after = experiment.rms(fitted.imu.with_effects(), linear)
     known = {name: (size, unit) for name, (size, _, unit) in calibration.rms.items() if name in after}
     before = (
@@ -772,8 +775,10 @@ class _Course:
         if candidate is not None and self.extension.found and not self.chosen:
             beside = promising(experiment, state)
             predicted = left_out_likelihood(experiment, state) if beside is None else beside.log_likelihood
-            inputs = {CATALOGUE[entry.name].curved() for entry in self.extension.found} - {""}
-            one_curve = beside is not None and beside.effect.curved() in inputs  # and not two of the same input
+            kinds = [CATALOGUE[entry.name] for entry in self.extension.found]
+            inputs = {(kind.owner, kind.curved()) for kind in kinds}
+            # and not two of the same input
+            one_curve = beside is not None and (beside.effect.owner, beside.effect.curved()) in inputs
             # what was named in part was a guess at the same misfit, or the curve is of what it leaves
             guessed = one_curve or predicted <= candidate.log_likelihood + _GUESSED
             candidate = candidate if guessed else beside
@@ -856,8 +861,8 @@ def _with_hands(
 
     Its fit and the causes that stand out are returned as well. A ramp and what temperature does must not pass for
     drift; of several recordings a ramp in one of them may, until it stands out, for the others show what drift is
-    usual. Nor must a cause that stands out: the drift is estimated again beside it. `known`: a fit and its causes where
-    the noise knows the drift.
+    usual. Nor must effects that stand out, however many: drift and hands are estimated again beside them, until they
+    are the same. `known`: a fit and its causes where the noise knows the drift.
     """
     calibration, remade, level = examination.calibration, examination.remade, examination.level
     if known is None:
@@ -865,7 +870,8 @@ def _with_hands(
     else:
         base, first = known
         causes = [base.evidence.blocks[cause.block] for cause in first.causes]
-    for count in range(3):
+    for count in range(_ROUNDS):
+        before = {block.name for block in causes}
         steady = [block for block in base.evidence.blocks if block.name.partition(".")[2] in _STEADY]
         none = np.zeros((len(base.weights), 0))
         columns = np.concatenate([none, *(block.columns for block in (*steady, *causes))], axis=1)
@@ -876,20 +882,10 @@ def _with_hands(
         experiment = _moved(remade, drift, drifted(noise, drift))
         base = experiment.fit()
         selection = select(base.evidence, level)
-        chosen = [cause.block for cause in selection.causes]
-        ramps = _ramps_beside(base.evidence, chosen, level)
-        causes = [base.evidence.blocks[k] for k in (*chosen, *ramps)]
-        if not causes or (count == 1 and not ramps) or count == 2:
+        causes = [base.evidence.blocks[k] for k in standing_out(base.evidence, selection, level)]
+        if {block.name for block in causes} <= before or count == _ROUNDS - 1:
             return experiment, drifted(noise, drift), base, selection
     raise AssertionError
-
-
-def _ramps_beside(evidence: Evidence, chosen: Sequence[int], level: float) -> list[int]:
-    """Return the blocks of ramps in one of several recordings that stand out beside chosen blocks."""
-    p_value = evidence.scores(chosen).p_value
-    effects = {k: CATALOGUE[block.name] for k, block in enumerate(evidence.blocks) if block.kind == "effect"}
-    ramps = [k for k, kind in effects.items() if kind.recording and kind.plain in _STEADY and k not in chosen]
-    return [k for k in ramps if evidence.family_wise(float(p_value[k])) < level]
 
 
 def _moved(remade: Callable[[NoiseModel], Experiment], drift: DriftComponents | None, noise: NoiseModel) -> Experiment:

@@ -30,6 +30,8 @@ _SECOND_ORDER = 0.02
 the effect, so that a slope of 10 % against the gain leaves 1 % of χ² in the shape of a higher power."""
 _PARTNERS = 12
 """Effects, best first, that are tried with every other where one alone does not do."""
+_TOGETHER = 4
+"""Effects beside which drift is estimated: more than are ever named, fewer than imitate any misfit."""
 _TRIED = 40
 """Pairs, best first, that are asked whether they leave anything."""
 
@@ -101,6 +103,24 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
     named = [k for k in named if evidence.family_wise(float(scores.p_value[k])) < level][:1]
     rivals = [k for k in close if k not in named]
     return Selection((_cause(evidence, named + rivals, scores),) if named else (), False, p_value, scores)
+
+
+def standing_out(evidence: Evidence, selection: Selection, level: float) -> list[int]:
+    """Return the blocks of all effects that stand out: the causes selected, and one after another beside those."""
+    chosen = [cause.block for cause in selection.causes]
+    while len(chosen) < _TOGETHER:
+        scores, names = evidence.scores(chosen), {evidence.blocks[k].name for k in chosen}
+        clear = [
+            k
+            for k in _leaders(evidence, scores)
+            if evidence.blocks[k].kind == "effect"
+            and evidence.blocks[k].name not in names
+            and evidence.family_wise(float(scores.p_value[k])) < level
+        ]
+        if not clear:
+            break
+        chosen.append(clear[0])
+    return chosen
 
 
 def shape_of(evidence: Evidence, level: float = LEVEL) -> tuple[EffectBlock, float] | None:
