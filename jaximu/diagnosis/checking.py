@@ -47,6 +47,7 @@ from jaximu.ground.vectors import lengths_of, sigmas_of, submatrix
 from jaximu.mistakes import prepared
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.observations import POWER_ON
@@ -90,7 +91,8 @@ def check(
     recording to its noise, the noise is widened, kind by kind, to what it scatters about a fresh one.
 
     **Arguments:** `recordings`, `gravity`, `static`, `segmentation` as for [`jaximu.diagnosis.diagnose`]; gravity
-    stated as it was for the old calibration is taken for the same place, whose uncertainty is common to both.
+    stated as it was for the old calibration is taken for the same place, whose uncertainty is common to both. Where it
+    states a latitude, the Earth's rotation is no finding: it is taken off.
     Recordings may be data that hold them, such as `jaximu.data.RecordedStations`. `level`: rate of false alarms.
 
     A recording with too few poses is followed by the filter in use (`jaximu.calibration.followed_in_use`) from its
@@ -132,7 +134,7 @@ def _checked(
 ) -> Validity:
     """Compare with recordings that were looked over: by their poses, or by a filter where there are too few."""
     old = Old.of(calibration, gravity)
-    recordings, findings = _without_losses(recordings, Choices(gravity, noise, segmentation))
+    recordings, findings, known = _as_fitted_anew(recordings, Choices(gravity, noise, segmentation))
     try:
         parts = tuple(segment(recording, segmentation) for recording in recordings)
         if len(recordings) == 1 and len(parts[0].intervals) < _FEWEST_POSES:
@@ -141,7 +143,8 @@ def _checked(
             )
     except NotPossibleError as error:
         return _followed(calibration, old, recordings, gravity, noise, level, error)
-    data = RecordedByHand(parts, observed_poses(parts, gravity.value, noise=noise))
+    data = RecordedByHand(parts, observed_poses(parts, gravity.value, noise=noise), known)
+    data = data if noise is None else data.with_noise(noise)
     notes = [finding.text for finding in findings]
     notes += [note for source in (*recordings, *parts) for note in source.notes]
     validity = _compared(calibration, old, data, noise, level, notes)
@@ -151,13 +154,18 @@ def _checked(
     return validity
 
 
-def _without_losses(recordings: Sequence[Recording], choices: Choices) -> tuple[Sequence[Recording], Sequence[Finding]]:
-    """Return recordings without the turns that lost time, as a fresh fit shows them, and what else only it shows."""
+def _as_fitted_anew(
+    recordings: Sequence[Recording], choices: Choices
+) -> tuple[Sequence[Recording], Sequence[Finding], Imu | None]:
+    """Return what a fresh fit shows: recordings without turns that lost time, what else it finds, and known effects.
+
+    These are the Earth's rotation, where a latitude is stated.
+    """
     try:
         fresh, findings = calibrate_ready(recordings, choices)
     except JaximuError:  # too few poses for a calibration, which may do for a check
-        return recordings, ()
-    return [part.recording for part in fresh.segmentations], findings
+        return recordings, (), None
+    return [part.recording for part in fresh.segmentations], findings, fresh.imu
 
 
 def _compared(

@@ -841,7 +841,7 @@ class _Course:
             extension.base.limits,
             dict(sorted(blind.items())),
             checks_of(extension.base, extension.experiment),
-            _suggestion(verdict, named, noises, self.learned, self.shape),
+            _to_state(named, extension.base.limits) or _suggestion(verdict, named, noises, self.learned, self.shape),
             tuple(note for note in dict.fromkeys(notes) if note.casefold().rstrip(".") not in texts),
             examination.calibration,
             extension.experiment,
@@ -988,6 +988,28 @@ def _named(experiment: Experiment, state: State, entry: Found, gain: Gain | None
         gain,
         Path(experiment.recordings[effect.recording - 1].name).name if effect.recording else "",
     )
+
+
+def stated_instead(name: str) -> list[tuple[type[Effect], str]]:
+    """Return what an option states, of an effect and its look-alikes, and the sentence that asks for the option."""
+    plain = name.partition("@")[0]
+    alike = listed([effect_title(other) for other in CATALOGUE[name].look_alikes], "or")
+    return [
+        (
+            CATALOGUE[other],
+            f"{sentence(effect_title(plain))} looks like {alike}. State {CATALOGUE[other].stated_by}: "
+            f"{CATALOGUE[other].english} is then taken off.",
+        )
+        for other in (plain, *CATALOGUE[name].look_alikes)
+        if CATALOGUE[other].stated_by
+    ]
+
+
+def _to_state(effects: Sequence[Named], limits: Sizes) -> str:
+    """Ask for what an option states and an effect looks like; empty where nothing is or the recording cannot see it."""
+    seen = {name.partition("@")[0] for name, (limit, _) in limits.items() if limit < CATALOGUE[name].possible}
+    asked = (one for effect in effects for one in stated_instead(effect.name))
+    return next((text for kind, text in asked if kind.name in seen), "")
 
 
 def _suggestion(

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 
 from jaximu.diagnosis import COMMON_DRIFT, Attributed, Attribution, CommonDrift
+from jaximu.diagnosis.diagnosis import stated_instead
 from jaximu.ground.page import Page, Part, Picture, Statement, Table
 from jaximu.ground.quantities import counted, listed, number, probability, readable, sentence, size, unit_text
 from jaximu.mistakes.titles import effect_title
@@ -106,15 +107,9 @@ def _first(attribution: Attribution) -> Iterator[Part]:
 
 def _look_alikes(attribution: Attribution) -> Iterator[Statement]:
     for finding in attribution.findings:
-        alike = [] if finding.name not in CATALOGUE else list(CATALOGUE[finding.name].look_alikes)
-        settled = [name for name in alike if CATALOGUE[name].scope == "session" and "attitude" in CATALOGUE[name].needs]
-        if finding.belongs_to == "board" and settled and attribution.latitude is None:
-            yield Statement(
-                "What the common part may be",
-                f"{sentence(effect_title(finding.name))} that all units have in common looks like "
-                f"{listed([effect_title(name) for name in settled], 'or')}. State --latitude: it is then taken off.",
-                caution=True,
-            )
+        if finding.name in CATALOGUE and finding.belongs_to == "board" and attribution.latitude is None:
+            for _, text in stated_instead(finding.name):
+                yield Statement("What the common part may be", text, caution=True)
 
 
 def _verdicts_table(attribution: Attribution) -> Table:

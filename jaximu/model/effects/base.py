@@ -95,6 +95,7 @@ class Effect(eqx.Module):
     typical: ClassVar[float]  # a plausible size of a coefficient of an SI output, to scale it in a fit
     plausible: ClassVar[float] = 100.0  # typical sizes that it may have where data do not say: as good as free
     possible: ClassVar[float] = float("inf")  # the most that nature lets the coefficients' root sum of squares be, SI
+    stated_by: ClassVar[str] = ""  # the option that states it, so that it is taken off
     known: ClassVar[float] = 0.0  # of a set-up: how well (1σ) a coefficient is known beforehand; 0: not at all
     inner: ClassVar[Mapping[str, Inner]] = MappingProxyType({})
     shares: ClassVar[str] = ""  # the plain name of another effect whose inner parameters it has, where that is there

@@ -27,6 +27,7 @@ class GyroEarthRotation(Effect):
     needs = ("attitude",)
     excited_by = "orientations at rest"
     look_alikes = ("gyro.g_sensitivity",)
+    stated_by = "--latitude"
     source = "WGS 84 (NGA.STND.0036), mean angular velocity of the Earth"
     typical = EARTH_RATE
     possible = EARTH_RATE
