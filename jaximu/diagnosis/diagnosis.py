@@ -250,7 +250,12 @@ class Diagnosis(Result, Document, page="diagnosis"):
             "detection_limits": {
                 name: {"value": value, "unit": unit} for name, (value, unit) in self.detection_limits.items()
             },
-            "hidden": [entries(cause, "name", "limit", "unit", "shift") for cause in self.hidden],
+            "hidden": [
+                entries(cause, "name", "limit", "unit", "shift")
+                | {"hardly": {"combination": weights.tolist(), "limit": limit if np.isfinite(limit) else None}}
+                for cause in self.hidden
+                for weights, limit in [cause.hardly]
+            ],
             "checks": [check.document() for check in self.checks],
             "next": [
                 {"record": option.text, "power": option.powers, "power_now": option.before} for option in self.options

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaximu.diagnosis.evidence import EffectBlock
+from jaximu.diagnosis.evidence import BLIND, EffectBlock, Evidence
 from jaximu.diagnosis.experiment import State
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import rms
@@ -14,6 +14,8 @@ from jaximu.ground.vectors import sigmas_of
 
 _NOTHING = 0.05
 """Standard deviations below which a shift is not listed."""
+_LEAST = 10.0
+"""Detection limits from which on a combination of coefficients that hardly shows is stated by itself."""
 
 
 @dataclass(frozen=True)
@@ -21,12 +23,24 @@ class Hidden:
     """A cause as large as its detection limit: `limit` in `unit`, and the shift of each number that it would move.
 
     shift: by the number's name, in its standard deviations, root mean square over the directions of the coefficients.
+    hardly: the combination (q,) of coefficients, of length one, that shows least, and its own limit, infinite where
+    nothing shows it. The limit is that of random combinations, and says nothing of this one.
     """
 
     name: str
     limit: float
     unit: str
     shift: dict[str, float]
+    hardly: tuple[FloatArray, float]
+
+    @property
+    def combination(self) -> str:
+        """The combination that shows least, in words, where its limit is another than that of the others."""
+        weights, limit = self.hardly
+        if limit < _LEAST * self.limit:
+            return ""
+        alike = weights.min() > 0.5 * weights.max()
+        return "on all axes alike" if alike else f"in the combination ({', '.join(f'{w:.2f}' for w in weights)})"
 
     @property
     def worst(self) -> tuple[str, float]:
@@ -47,7 +61,10 @@ def shift_by(state: State, block: EffectBlock) -> FloatArray:
 
 def hidden_causes(state: State) -> list[Hidden]:
     """Return each cause at its detection limit and what it would do, the worst first."""
-    causes = [Hidden(name, limit, unit, _shifts(state, name, limit)) for name, (limit, unit) in state.limits.items()]
+    causes = [
+        Hidden(name, limit, unit, _shifts(state, name, limit), _hardly_seen(state.evidence, name, limit))
+        for name, (limit, unit) in state.limits.items()
+    ]
     return sorted(causes, key=lambda cause: -cause.worst[1])
 
 
@@ -57,6 +74,19 @@ def _shifts(state: State, name: str, limit: float) -> dict[str, float]:
     largest = np.max([_spread(shift_by(state, block)) for block in state.evidence.blocks if block.name == name], axis=0)
     sizes = zip(state.fitted, limit * largest / sigmas, strict=True)
     return {str(state.names[row]): float(size) for row, size in sizes if size >= _NOTHING}
+
+
+def _hardly_seen(evidence: Evidence, name: str, limit: float) -> tuple[FloatArray, float]:
+    """Return the combination of an effect's coefficients that shows least, where on its grid it shows most."""
+    informations = [
+        evidence.information(k) / block.sizes[:, None] / block.sizes
+        for k, block in enumerate(evidence.blocks)
+        if block.name == name
+    ]
+    values, vectors = np.linalg.eigh(max(informations, key=np.trace))
+    weights = vectors[:, 0] * np.sign(vectors[np.argmax(np.abs(vectors[:, 0])), 0])
+    seen = values[0] > BLIND**2 * values[-1]
+    return weights, float(limit * np.sqrt(values.mean() / values[0])) if seen else float("inf")
 
 
 def _spread(shift: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from scipy.linalg import null_space
 from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.selection import select
-from jaximu.estimation.leave_out import LeftOut, leave_out, off
+from jaximu.estimation.leave_out import LeftOut, leave_out
 from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import Rows, Sizes
 from jaximu.estimation.uncertainty import describe
@@ -171,29 +171,27 @@ def _by_parts(experiment: Experiment, base: State, interleaved: bool) -> Gain:
     determine, for it holds too few poses, is not predicted and does not count.
     """
     evidence = base.evidence
-    root = np.linalg.inv(base.weights)
     real = experiment.real
     count_out, errors, sums = 0, np.zeros((2, len(real))), np.zeros((2, 2))  # before and after: χ² and log-likelihood
     for rows, scored in experiment.folds(_FOLDS, interleaved):
         if len(real) - len(rows) <= evidence.jacobian.shape[1]:
             continue
         models = [(1.0, ())], _models(evidence.without(base.weights[:, rows]))
-        parts = [[(share, *_left_out(base, blocks, rows, scored)) for share, blocks in options] for options in models]
-        blind = [null_space(part.directions.T) for options in parts for _, part, _ in options if part.blind]
+        parts = [[(share, _left_out(base, blocks, rows, scored)) for share, blocks in options] for options in models]
+        blind = [null_space(part.directions.T) for options in parts for _, part in options if part.blind]
         determined = null_space(np.concatenate(blind, axis=1).T, rcond=1e-6) if blind else np.eye(int(scored.sum()))
         count_out += determined.shape[1]
         for after, options in enumerate(parts):
-            estimate = np.sum([share * part.errors for share, part, _ in options], axis=0)
+            estimate = np.sum([share * part.errors for share, part in options], axis=0)
             spread = sum(
                 share * (part.covariance + np.outer(part.errors - estimate, part.errors - estimate))
-                for share, part, _ in options
+                for share, part in options
             )
             shown = determined.T @ estimate
             sums[after] += _beside_open(
                 shown, determined.T @ np.asarray(spread) @ determined, np.zeros((len(shown), 0)), np.eye(0)
             )
-            rest = (root @ sum(share * residual for share, _, residual in options))[rows[scored]]
-            errors[after, rows[scored]] = rest - off(determined, estimate)
+            errors[after, rows[scored]] = determined @ shown
     before, after = (
         Prediction(real.rms(error), float(squared), count_out, float(likelihood))
         for error, (squared, likelihood) in zip(errors, sums, strict=True)
@@ -231,12 +229,9 @@ def _models(evidence: Evidence) -> list[tuple[float, tuple[int, ...]]]:
     return [(weight / total, blocks) for weight, blocks in models]
 
 
-def _left_out(base: State, blocks: Sequence[int], rows: IntArray, scored: BoolArray) -> tuple[LeftOut, FloatArray]:
-    """Predict those `scored` (m,) of conditions left out, by place (m,), with blocks in the model.
-
-    What the others' numbers leave of all conditions (n,) is returned too.
-    """
+def _left_out(base: State, blocks: Sequence[int], rows: IntArray, scored: BoolArray) -> LeftOut:
+    """Predict those `scored` (m,) of conditions left out, by place (m,), with blocks in the model."""
     evidence = base.evidence
     columns = np.concatenate([evidence.jacobian, *(evidence.blocks[k].columns for k in blocks)], axis=1)
     (part,) = leave_out(base.weights, columns, evidence.residual, [rows])
-    return part.only(scored), evidence.residual - columns @ part.numbers
+    return part.only(scored)

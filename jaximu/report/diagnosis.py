@@ -388,6 +388,18 @@ def _limits(diagnosis: Diagnosis) -> Iterator[Part]:
         ],
         brief=6,
     )
+    hardly = [
+        f"{effect_title(cause.name)} {cause.combination}, "
+        + (
+            "which no test sees"
+            if np.isinf(cause.hardly[1])
+            else f"seen from {size(cause.hardly[1], cause.unit, 2)} on"
+        )
+        for cause in diagnosis.hidden
+        if cause.combination
+    ]
+    if hardly:
+        yield Statement("What a recording like this hardly shows", f"{sentence('; '.join(hardly))}.")
 
 
 def _shift_words(diagnosis: Diagnosis, cause: Hidden) -> str:
