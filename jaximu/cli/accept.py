@@ -5,16 +5,16 @@ from __future__ import annotations
 import inspect
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
-from jaximu.cli.options import option
+from jaximu.cli.options import option, switch, takes_options
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _STATUS = {"pass": 0, "fail": 3, "undecided": 4}
 
 
-@dataclass(frozen=True)
+@takes_options
 class AcceptCommand:
     """Hold calibrations to limits: pass, fail or undecided, with guard bands from the stated uncertainty; certificate.
 
@@ -43,41 +43,25 @@ class AcceptCommand:
 
     """
 
-    calibrations: Annotated[
-        tuple[Path, ...],
-        Positional,
-        option("CALIBRATION...", "calibration.json, or a fleet's TABLE.parquet.", name="calibrations"),
-    ] = ()
-    limits: Annotated[
-        Path | None, option("LIMITS.toml", "Limits; or TABLE.parquet of a fleet, whose population sets them.")
-    ] = None
-    noise: Annotated[Path | None, option("ALLAN.json", "From jaximu allan, for limits of noise and repeatability.")] = (
-        None
+    calibrations: tuple[Path, ...] = option(
+        "CALIBRATION...", "calibration.json, or a fleet's TABLE.parquet.", (), Positional
     )
-    diagnosis: options.DiagnosisFile = None
-    trace: Annotated[
-        Path | None,
-        option("TRACE.toml", "Serial number, operator, references …, beside what a calibration says."),
-    ] = None
-    rule: Annotated[Literal["guarded", "simple"] | None, arg(help="Decision rule, instead of that of LIMITS.")] = None
-    risk: Annotated[
-        float | None, arg(help="Probability of a wrong decision at most, instead of that of LIMITS (0.05).")
-    ] = None
-    fail_on: Annotated[
-        Literal["undecided", "fail", "never"],
-        arg(help="Which verdicts end with another exit status than 0: both, fail alone, or none."),
-    ] = "undecided"
-    golden: Annotated[str, option("DEVICE", "Of a table: the unit recorded again and again to watch the line.")] = ""
-    measurements: Annotated[
-        Path | None,
-        option(
-            "FILE",
-            "Also write each limit with value and verdict for a test system: .csv, .xml (JUnit), .json (OpenHTF).",
-        ),
-    ] = None
-    without_certificate: Annotated[bool, arg(help="Write the verdict alone to DIR.")] = False
-    explain: Annotated[bool, arg(help="Explain LIMITS.toml and TRACE.toml, and do nothing else.")] = False
-    results: options.Output = options.RESULTS
+    limits: Path | None = option("LIMITS.toml", "Limits; or TABLE.parquet of a fleet, whose population sets them.")
+    noise: Path | None = option("ALLAN.json", "From jaximu allan, for limits of noise and repeatability.")
+    diagnosis: Path | None = option(*options.DIAGNOSIS)
+    trace: Path | None = option("TRACE.toml", "Serial number, operator, references …, beside what a calibration says.")
+    rule: Literal["guarded", "simple"] | None = switch("Decision rule, instead of that of LIMITS.", None)
+    risk: float | None = option("NUMBER", "Probability of a wrong decision at most, instead of that of LIMITS (0.05).")
+    fail_on: Literal["undecided", "fail", "never"] = switch(
+        "Which verdicts end with another exit status than 0: both, fail alone, or none.", "undecided"
+    )
+    golden: str = option("DEVICE", "Of a table: the unit recorded again and again to watch the line.", "")
+    measurements: Path | None = option(
+        "FILE", "Also write each limit with value and verdict for a test system: .csv, .xml (JUnit), .json (OpenHTF)."
+    )
+    without_certificate: bool = switch("Write the verdict alone to DIR.")
+    explain: bool = switch("Explain LIMITS.toml and TRACE.toml, and do nothing else.")
+    results: options.Results = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
+from jaximu.cli.options import takes_options
 from jaximu.ground.document import Json
 from jaximu.ground.gravity import STANDARD
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jaximu.noise.analysis import NoiseAnalysis
 
 
-@dataclass(frozen=True)
+@takes_options
 class AllanCommand:
     """Identify the noise of a unit at rest from its Allan deviation; several LOGs show how repeatable its bias is.
 
@@ -28,8 +28,8 @@ class AllanCommand:
     """
 
     logs: options.Logs
-    log: options.Reading = options.READING
-    results: options.Output = options.RESULTS
+    log: options.LogOptions = options.READING
+    results: options.Results = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""

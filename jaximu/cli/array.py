@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from jaximu.cli import options
 from jaximu.cli.messages import progress
+from jaximu.cli.options import takes_options
 
 
-@dataclass(frozen=True)
+@takes_options
 class ArrayCommand(options.Fits):
     """Calibrate several units on one rigid body: rotation, position and clock of each, and which one disturbs.
 

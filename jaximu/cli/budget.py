@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
-from jaximu.cli.options import option
+from jaximu.cli.options import option, switch, takes_options
 from jaximu.ground.errors import InputError
 
 
-@dataclass(frozen=True)
+@takes_options
 class BudgetCommand:
     """Compute an error budget: how each error of a set-up reaches each parameter, and what to improve for a goal.
 
@@ -27,15 +26,14 @@ class BudgetCommand:
 
     """
 
-    specification_file: Annotated[Path | None, Positional, option("SPEC", "TOML file; --explain describes it.")] = None
-    goal: Annotated[
-        tuple[str, ...],
-        option("GOAL [GOAL ...]", 'Standard deviations wanted, such as "accelerometer.bias 0.2 mg".'),
-    ] = ()
-    check: Annotated[int, option("N", "Compare with N simulated sessions, each calibrated in full.")] = 0
-    seed: Annotated[int, option("N", "Random seed of these sessions.")] = 0
-    explain: Annotated[bool, arg(help="Describe the specification and exit.")] = False
-    results: options.Output = options.RESULTS
+    specification_file: Path | None = option("SPEC", "TOML file; --explain describes it.", None, Positional)
+    goal: tuple[str, ...] = option(
+        "GOAL [GOAL ...]", 'Standard deviations wanted, such as "accelerometer.bias 0.2 mg".', ()
+    )
+    check: int = option("N", "Compare with N simulated sessions, each calibrated in full.", 0)
+    seed: int = option("N", "Random seed of these sessions.", 0)
+    explain: bool = switch("Describe the specification and exit.")
+    results: options.Results = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""

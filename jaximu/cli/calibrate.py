@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Literal
-
-from tyro.conf import arg
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
+from jaximu.cli.options import switch, takes_options
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
@@ -16,7 +15,7 @@ if TYPE_CHECKING:
     from jaximu.ground.gravity import LocalGravity
 
 
-@dataclass(frozen=True)
+@takes_options
 class CalibrateCommand(options.Fits):
     """Calibrate a unit from poses at rest and the turns between them, without equipment.
 
@@ -30,18 +29,15 @@ class CalibrateCommand(options.Fits):
     """
 
     logs: options.Logs
-    method: Annotated[
-        Literal["joint", "two-step", "two-step-rk4", "accelerometer"],
-        arg(help="Fit both sensors together, one after the other, or the accelerometer alone."),
-    ] = "joint"
+    method: Literal["joint", "two-step", "two-step-rk4", "accelerometer"] = switch(
+        "Fit both sensors together, one after the other, or the accelerometer alone.", "joint"
+    )
     loss: options.LossChoice = "linear"
     effect: options.EffectNames = ()
-    poses: options.Poses = options.POSES
+    poses: options.PoseOptions = options.POSES
     repair: options.RepairFlag = False
-    means: Annotated[bool, arg(help="LOG is a table with one row of mean outputs per pose, as papers print them.")] = (
-        False
-    )
-    traced: options.Traced = options.TRACED
+    means: bool = switch("LOG is a table with one row of mean outputs per pose, as papers print them.")
+    traced: options.TraceOptions = options.TRACED
 
     def run(self) -> None:
         """Do what the command line says."""

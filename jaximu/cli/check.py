@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Literal
-
-from tyro.conf import arg
+from typing import Literal
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
+from jaximu.cli.options import switch, takes_options
 
 
-@dataclass(frozen=True)
+@takes_options
 class CheckCommand(options.Fits):
     """Check whether an old calibration is still valid for a new recording, and which parameters moved.
 
@@ -25,11 +23,10 @@ class CheckCommand(options.Fits):
 
     calibration: options.CalibrationFile
     logs: options.Logs
-    poses: options.Poses = options.POSES
-    fail_on: Annotated[
-        Literal["never", "invalid"],
-        arg(help="Whether a calibration that is no longer valid ends with exit status 1, for scripts."),
-    ] = "never"
+    poses: options.PoseOptions = options.POSES
+    fail_on: Literal["never", "invalid"] = switch(
+        "Whether a calibration that is no longer valid ends with exit status 1, for scripts.", "never"
+    )
 
     def run(self) -> None:
         """Do what the command line says."""

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import MISSING
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
-from jaximu.cli.options import option
+from jaximu.cli.options import option, switch, takes_options
 from jaximu.ground.errors import InputError
 
 
-@dataclass(frozen=True)
+@takes_options
 class CompareCommand:
     """Compare calibrations of a unit: what moved, what that does to the output, how each number drifts.
 
@@ -27,27 +27,19 @@ class CompareCommand:
 
     """
 
-    calibrations: Annotated[
-        tuple[Path, ...],
-        Positional,
-        option("CALIBRATION CALIBRATION...", "Two calibration.json of a unit, or more.", name="calibrations"),
-    ]
-    dates: Annotated[
-        str | None,
-        option(
-            "DATES",
-            "Date of each, in their order: 2025-03-04,2026-03-02; default: those they state, else a step apart.",
-        ),
-    ] = None
-    limits: Annotated[
-        Path | None, option("LIMITS.toml", "Limits, as for jaximu accept: when is each reached at the drift seen?")
-    ] = None
-    rate: Annotated[str, option("TEXT", "Compare the gyroscope's output up to this rate.")] = "250 deg/s"
-    level: Annotated[float, option("P", "Rate of false alarms, all numbers together.")] = 0.05
-    fail_on: Annotated[
-        Literal["never", "moved"], arg(help="Whether numbers that moved end with exit status 1, for scripts.")
-    ] = "never"
-    results: options.Output = options.RESULTS
+    calibrations: tuple[Path, ...] = option(
+        "CALIBRATION CALIBRATION...", "Two calibration.json of a unit, or more.", MISSING, Positional
+    )
+    dates: str | None = option(
+        "DATES", "Date of each, in their order: 2025-03-04,2026-03-02; default: those they state, else a step apart."
+    )
+    limits: Path | None = option("LIMITS.toml", "Limits, as for jaximu accept: when is each reached at the drift seen?")
+    rate: str = option("TEXT", "Compare the gyroscope's output up to this rate.", "250 deg/s")
+    level: float = option("P", "Rate of false alarms, all numbers together.", 0.05)
+    fail_on: Literal["never", "moved"] = switch(
+        "Whether numbers that moved end with exit status 1, for scripts.", "never"
+    )
+    results: options.Results = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""

@@ -1,17 +1,16 @@
 """`jaximu compensate`: apply a calibration to a recording."""
 
-from dataclasses import dataclass
+from dataclasses import MISSING
 from pathlib import Path
-from typing import Annotated
 
 from tyro.conf import Positional
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
-from jaximu.cli.options import option
+from jaximu.cli.options import option, takes_options
 
 
-@dataclass(frozen=True)
+@takes_options
 class CompensateCommand:
     """Apply a calibration to a log; the corrected log is in m/s² and rad/s.
 
@@ -22,18 +21,15 @@ class CompensateCommand:
     """
 
     calibration: options.CalibrationFile
-    recording: Annotated[Path, Positional, option("LOG", "The log to correct.")]
-    output: Annotated[
-        Path,
-        option(
-            "OUT",
-            "File to write; the suffix sets the format. OUT.mcap, or OUT without a suffix for a ROS 2 bag, holds "
-            "the log before and after, and how far its magnitude is from gravity.",
-            name="output",
-            aliases=["-o"],
-        ),
-    ]
-    log: options.Reading = options.READING
+    recording: Path = option("LOG", "The log to correct.", MISSING, Positional)
+    output: Path = option(
+        "OUT",
+        "File to write; the suffix sets the format. OUT.mcap, or OUT without a suffix for a ROS 2 bag, holds "
+        "the log before and after, and how far its magnitude is from gravity.",
+        MISSING,
+        aliases=["-o"],
+    )
+    log: options.LogOptions = options.READING
 
     def run(self) -> None:
         """Do what the command line says."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
-from jaximu.cli.options import option
+from jaximu.cli.options import option, takes_options
 from jaximu.ground.errors import InputError
 from jaximu.ground.reexport import later
 from jaximu.ground.units import SENSOR_UNITS
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _LATITUDE = 45.0
 
 
-@dataclass(frozen=True)
+@takes_options
 class ConsequencesCommand(options.Reads):
     """Show how far off position, velocity and attitude get by calibration errors and noise, and which dominates.
 
@@ -42,35 +42,25 @@ class ConsequencesCommand(options.Reads):
     """
 
     calibration: options.CalibrationFile
-    path: Annotated[Path | None, option("SPEC|LOG", "The path (default: ten minutes of level driving).")] = None
+    path: Path | None = option("SPEC|LOG", "The path (default: ten minutes of level driving).")
     noise_file: options.NoiseFile = None
-    diagnosis: options.DiagnosisFile = None
-    against: Annotated[Path | None, option("CALIBRATION", "Compare with another calibration of the unit.")] = None
-    duration: Annotated[
-        float | None, option("S", "Length of the path; default 600 s, of a LOG 60 s, of a SPEC all.")
-    ] = None
-    temperature: Annotated[
-        float | None, option("DEGC", "Temperature of level driving (default: the calibration's).")
-    ] = None
-    accel_range: Annotated[str | None, option("TEXT", 'Refuse a path beyond this range, such as "16 g".')] = None
-    gyro_range: Annotated[str | None, option("TEXT", 'The same, such as "2000 deg/s".')] = None
-    draws: Annotated[
-        int, option("N", "Simulated flights with all errors drawn, beside the linear budget; 0 for none.")
-    ] = 100
-    seed: Annotated[int, option("N", "Seed of these draws.")] = 0
-    noise_for: Annotated[
-        str | None,
-        option(
-            "LIST",
-            "Noise for these estimators, enlarged for the motion of the path: gtsam, vins, openvins, lio-sam, "
-            "kalibr, px4, ardupilot, separated by commas.",
-        ),
-    ] = None
-    noise_interval: Annotated[float, option("S", "Time between two states (keyframes, fixes) of that estimator.")] = 1.0
-    reference: Annotated[
-        Path | None,
-        option("REF", "Attitude (and velocity or position) measured along LOG: noise from the errors seen."),
-    ] = None
+    diagnosis: Path | None = option(*options.DIAGNOSIS)
+    against: Path | None = option("CALIBRATION", "Compare with another calibration of the unit.")
+    duration: float | None = option("S", "Length of the path; default 600 s, of a LOG 60 s, of a SPEC all.")
+    temperature: float | None = option("DEGC", "Temperature of level driving (default: the calibration's).")
+    accel_range: str | None = option("TEXT", 'Refuse a path beyond this range, such as "16 g".')
+    gyro_range: str | None = option("TEXT", 'The same, such as "2000 deg/s".')
+    draws: int = option("N", "Simulated flights with all errors drawn, beside the linear budget; 0 for none.", 100)
+    seed: int = option("N", "Seed of these draws.", 0)
+    noise_for: str | None = option(
+        "LIST",
+        "Noise for these estimators, enlarged for the motion of the path: gtsam, vins, openvins, lio-sam, "
+        "kalibr, px4, ardupilot, separated by commas.",
+    )
+    noise_interval: float = option("S", "Time between two states (keyframes, fixes) of that estimator.", 1.0)
+    reference: Path | None = option(
+        "REF", "Attitude (and velocity or position) measured along LOG: noise from the errors seen."
+    )
 
     def run(self) -> None:
         """Do what the command line says."""

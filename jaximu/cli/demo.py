@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from jaximu.cli import options
 from jaximu.cli.diagnose import give_diagnosis
 from jaximu.cli.messages import progress
-from jaximu.cli.options import option
+from jaximu.cli.options import option, takes_options
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
 
@@ -29,7 +28,7 @@ _HIDDEN = {
 """Effects that the demonstration may hide, and the largest coefficient: a few times what the noise would cover."""
 
 
-@dataclass(frozen=True)
+@takes_options
 class DemoCommand:
     """Simulate a unit with a hidden flaw, diagnose it and write a report: no recording needed.
 
@@ -40,14 +39,10 @@ class DemoCommand:
 
     """
 
-    seed: Annotated[int, option("N", "Random seed of the unit and its noise.")] = 0
-    effect: Annotated[str | None, option("NAME", "Effect to hide (default: the seed chooses one).")] = None
-    data: Annotated[
-        Path | None, option("DIR", "Only write a simulated phone's recording there, to try commands on.")
-    ] = None
-    output: Annotated[Path, option("DIR", "Folder for recording and report.", name="output", aliases=["-o"])] = Path(
-        "jaximu-demo"
-    )
+    seed: int = option("N", "Random seed of the unit and its noise.", 0)
+    effect: str | None = option("NAME", "Effect to hide (default: the seed chooses one).")
+    data: Path | None = option("DIR", "Only write a simulated phone's recording there, to try commands on.")
+    output: Path = option("DIR", "Folder for recording and report.", Path("jaximu-demo"), aliases=["-o"])
     force: options.ForceFlag = False
 
     def run(self) -> None:

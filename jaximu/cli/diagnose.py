@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-from tyro.conf import arg
+from typing import TYPE_CHECKING, Any, Literal
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
-from jaximu.cli.options import option
+from jaximu.cli.options import option, switch, takes_options
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,7 +16,7 @@ if TYPE_CHECKING:
     from jaximu.ground.gravity import LocalGravity
 
 
-@dataclass(frozen=True)
+@takes_options
 class DiagnoseCommand(options.Fits):
     """Find what the model misses: name the effect, add it to the model and measure the gain on data not fitted.
 
@@ -39,33 +36,24 @@ class DiagnoseCommand(options.Fits):
     """
 
     logs: options.Logs
-    heldout: Annotated[Path | None, option("LOG", "Another recording of the unit, to measure the gain on.")] = None
-    reference: Annotated[
-        Path | None,
-        option(
-            "REF",
-            "What the turntable or fixture did, as for jaximu turntable (LOG itself if it has reference "
-            "columns): errors of the set-up are then tested as well. Or a measured attitude, as for jaximu reference.",
-        ),
-    ] = None
-    heldout_reference: Annotated[Path | None, option("REF", "The same for the held-out recording.")] = None
-    thermal: Annotated[
-        bool, arg(help="The unit was at rest while the temperature changed: test thermal effects only.")
-    ] = False
-    by: Annotated[
-        str | None,
-        option(
-            "PATTERN",
-            "LOGs are of several units in several sessions, as this pattern of their names or folders says, such as "
-            "'unit{unit}_session{session}': what belongs to a unit, to a session or to all of them is told apart.",
-        ),
-    ] = None
-    poses: options.Poses = options.POSES
+    heldout: Path | None = option("LOG", "Another recording of the unit, to measure the gain on.")
+    reference: Path | None = option(
+        "REF",
+        "What the turntable or fixture did, as for jaximu turntable (LOG itself if it has reference "
+        "columns): errors of the set-up are then tested as well. Or a measured attitude, as for jaximu reference.",
+    )
+    heldout_reference: Path | None = option("REF", "The same for the held-out recording.")
+    thermal: bool = switch("The unit was at rest while the temperature changed: test thermal effects only.")
+    by: str | None = option(
+        "PATTERN",
+        "LOGs are of several units in several sessions, as this pattern of their names or folders says, such as "
+        "'unit{unit}_session{session}': what belongs to a unit, to a session or to all of them is told apart.",
+    )
+    poses: options.PoseOptions = options.POSES
     repair: options.RepairFlag = False
-    fail_on: Annotated[
-        Literal["never", "unexplained", "effects"],
-        arg(help="Verdicts that end with exit status 1, for scripts: none, unexplained alone, or both."),
-    ] = "never"
+    fail_on: Literal["never", "unexplained", "effects"] = switch(
+        "Verdicts that end with exit status 1, for scripts: none, unexplained alone, or both.", "never"
+    )
 
     def run(self) -> None:
         """Do what the command line says."""

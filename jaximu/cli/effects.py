@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import difflib
 import inspect
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
 from jaximu.cli import options
-from jaximu.cli.options import option
+from jaximu.cli.options import option, takes_options
 from jaximu.ground.document import Json, entries
 from jaximu.ground.errors import InputError
 from jaximu.ground.page import Page, Section, Table
@@ -29,7 +28,7 @@ _SCOPES = {
 _ACTS_ON = {"input": "what the axes sense, before the gain", "output": "what the axes put out"}
 
 
-@dataclass(frozen=True)
+@takes_options
 class EffectsCommand:
     """List the effects that jaximu knows: formula, unit, scope, what excites each one and what it is mistaken for.
 
@@ -39,7 +38,7 @@ class EffectsCommand:
 
     """
 
-    name: Annotated[str | None, Positional, option("[NAME]", "Show this effect in full.")] = None
+    name: str | None = option("[NAME]", "Show this effect in full.", None, Positional)
     as_json: options.JsonFlag = False
 
     def run(self) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import MISSING
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 from jaximu.cli import options
 from jaximu.cli.messages import say
-from jaximu.cli.options import option
+from jaximu.cli.options import option, takes_options
 from jaximu.ground.errors import InputError
 from jaximu.ground.page import Code, Items, Page, Part, Section
 from jaximu.ground.reexport import later
@@ -17,7 +17,7 @@ from jaximu.report.export.catalogue import WRITERS, writer
 from jaximu.report.export.noise import TARGETS
 
 
-@dataclass(frozen=True)
+@takes_options
 class ExportCommand:
     """Write a calibration for another tool, with the equation to apply and what the file cannot carry.
 
@@ -29,29 +29,20 @@ class ExportCommand:
     """
 
     calibration: options.CalibrationFile
-    to: Annotated[str, option("FORMAT", f"One of {', '.join(WRITERS)}.")]
-    output: Annotated[Path | None, option("FILE", "Default: beside CALIBRATION.", name="output", aliases=["-o"])] = None
-    noise: Annotated[Path | None, option("IMU.YAML", "Noise densities, as jaximu allan -o DIR writes them.")] = None
-    axes: Annotated[
-        str | None,
-        option("MAP", "The --axes used for calibration, where CALIBRATION does not say how it was read."),
-    ] = None
-    in_force: Annotated[
-        Path | None,
-        option(
-            "FILE", "The autopilot's parameters during the log (.ulg, .bin, .params …): compose, and show what changes."
-        ),
-    ] = None
-    log_was: Annotated[
-        Literal["raw", "corrected"] | None,
-        option("{raw,corrected}", "Whether the calibrated log was corrected by these parameters, if it does not show."),
-    ] = None
-    instance: Annotated[int | None, option("N", "Which of the autopilot's sensors, from 0 (default: 0).")] = None
-    device: Annotated[int | None, option("ID", "The sensor's ID in PX4's parameters CAL_ACCn_ID.")] = None
-    rate_range: Annotated[float, option("DEG/S", "State the error of what the file leaves out up to this rate.")] = 250
-    temperature_range: Annotated[
-        str | None, option("LOW,HIGH", "State it between these temperatures in °C (default: ±20 K).")
-    ] = None
+    to: str = option("FORMAT", f"One of {', '.join(WRITERS)}.", MISSING)
+    output: Path | None = option("FILE", "Default: beside CALIBRATION.", aliases=["-o"])
+    noise: Path | None = option("IMU.YAML", "Noise densities, as jaximu allan -o DIR writes them.")
+    axes: str | None = option("MAP", "The --axes used for calibration, where CALIBRATION does not say how it was read.")
+    in_force: Path | None = option(
+        "FILE", "The autopilot's parameters during the log (.ulg, .bin, .params …): compose, and show what changes."
+    )
+    log_was: Literal["raw", "corrected"] | None = option(
+        "{raw,corrected}", "Whether the calibrated log was corrected by these parameters, if it does not show."
+    )
+    instance: int | None = option("N", "Which of the autopilot's sensors, from 0 (default: 0).")
+    device: int | None = option("ID", "The sensor's ID in PX4's parameters CAL_ACCn_ID.")
+    rate_range: float = option("DEG/S", "State the error of what the file leaves out up to this rate.", 250)
+    temperature_range: str | None = option("LOW,HIGH", "State it between these temperatures in °C (default: ±20 K).")
     as_json: options.JsonFlag = False
 
     def run(self) -> None:

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import MISSING
 from pathlib import Path
-from typing import Annotated
 
 from tyro.conf import Positional
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
-from jaximu.cli.options import option
+from jaximu.cli.options import option, takes_options
 from jaximu.cli.reference import read_reference
 from jaximu.ground.errors import InputError
 from jaximu.ground.reexport import later
 
 
-@dataclass(frozen=True)
+@takes_options
 class FilterCommand(options.Fits):
     """Calibrate from all of a recording, motion included, by a Kalman filter; or follow a calibrated unit in use.
 
@@ -36,31 +35,21 @@ class FilterCommand(options.Fits):
 
     """
 
-    log_path: Annotated[Path, Positional, option("LOG", "A recording that begins at rest.", name="log")]
-    online: Annotated[
-        Path | None,
-        option(
-            "CALIBRATION",
-            "Follow this calibrated unit through LOG, sample by sample: what changes, and is it this unit?",
-        ),
-    ] = None
-    reference: Annotated[
-        Path | None,
-        option(
-            "REF",
-            "A measured attitude as a further measurement, with its own clock: a table with time and quaternion, "
-            "Euler angles, rotation vectors or a table's angles (table_angle_z, table_angle_x …, outermost axis first) "
-            "and velocity or position if known; may be LOG itself.",
-        ),
-    ] = None
-    magnetometer: Annotated[
-        Path | None,
-        option(
-            "CALIBRATION",
-            "A calibration of the magnetometer in LOG (`jaximu magnetometer`): the Earth's field as a further "
-            "measurement, which shows the heading of every rest.",
-        ),
-    ] = None
+    log_path: Path = option("LOG", "A recording that begins at rest.", MISSING, Positional, name="log")
+    online: Path | None = option(
+        "CALIBRATION", "Follow this calibrated unit through LOG, sample by sample: what changes, and is it this unit?"
+    )
+    reference: Path | None = option(
+        "REF",
+        "A measured attitude as a further measurement, with its own clock: a table with time and quaternion, "
+        "Euler angles, rotation vectors or a table's angles (table_angle_z, table_angle_x …, outermost axis first) "
+        "and velocity or position if known; may be LOG itself.",
+    )
+    magnetometer: Path | None = option(
+        "CALIBRATION",
+        "A calibration of the magnetometer in LOG (`jaximu magnetometer`): the Earth's field as a further "
+        "measurement, which shows the heading of every rest.",
+    )
     effect: options.EffectNames = ()
     repair: options.RepairFlag = False
 

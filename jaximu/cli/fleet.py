@@ -6,15 +6,15 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
-from jaximu.cli.options import option
+from jaximu.cli.options import option, switch, takes_options
 from jaximu.ground.errors import InputError
 from jaximu.ground.stored import compiling
 
@@ -31,7 +31,7 @@ _TOGETHER = 1.0
 """Seconds within which processes that start together give their first rows."""
 
 
-@dataclass(frozen=True)
+@takes_options
 class FleetCommand:
     """Calibrate many units: one row per recording in one Parquet table, and a report on the population.
 
@@ -49,30 +49,24 @@ class FleetCommand:
 
     """
 
-    logs: Annotated[
-        tuple[str, ...],
-        Positional,
-        option("LOGS...", "Logs, folders, patterns in quotes, or a manifest (CSV).", name="logs"),
-    ]
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
-    output: Annotated[Path | None, option("TABLE.parquet", "The table to write.", name="output", aliases=["-o"])] = None
-    static: Annotated[
-        Path | None,
-        option(
-            "LOG|DIR", "A recording at rest to measure the noise, or a folder of them, each named after its device."
-        ),
-    ] = None
-    diagnose: Annotated[bool, arg(help="Also diagnose each recording.")] = False
-    engine: Annotated[Literal["local", "ray"], arg(help="Processes on this machine, or a Ray cluster.")] = "local"
-    workers: Annotated[int | None, option("N", "Number of processes (default: one per core).")] = None
+    logs: tuple[str, ...] = option(
+        "LOGS...", "Logs, folders, patterns in quotes, or a manifest (CSV).", MISSING, Positional
+    )
+    log: options.LogOptions = options.READING
+    local: options.GravityOptions = options.LOCAL
+    output: Path | None = option("TABLE.parquet", "The table to write.", aliases=["-o"])
+    static: Path | None = option(
+        "LOG|DIR", "A recording at rest to measure the noise, or a folder of them, each named after its device."
+    )
+    diagnose: bool = switch("Also diagnose each recording.")
+    engine: Literal["local", "ray"] = switch("Processes on this machine, or a Ray cluster.", "local")
+    workers: int | None = option("N", "Number of processes (default: one per core).")
     field: options.FieldText = None
-    poses: options.Poses = options.POSES
-    limits: Annotated[
-        Path | None,
-        option("LIMITS.toml", "Hold every unit to these limits, and follow the line; see jaximu accept --explain."),
-    ] = None
-    golden: Annotated[str, option("DEVICE", "With --limits: the unit that watches the line.")] = ""
+    poses: options.PoseOptions = options.POSES
+    limits: Path | None = option(
+        "LIMITS.toml", "Hold every unit to these limits, and follow the line; see jaximu accept --explain."
+    )
+    golden: str = option("DEVICE", "With --limits: the unit that watches the line.", "")
     as_json: options.JsonFlag = False
 
     def run(self) -> None:

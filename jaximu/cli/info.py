@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
+from jaximu.cli.options import takes_options
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.ground.gravity import STANDARD
@@ -53,7 +54,7 @@ class Use:
         return f"jaximu {self.verb}{self.before} {shlex.quote(str(path))}{stated}{self.after}"
 
 
-@dataclass(frozen=True)
+@takes_options
 class InfoCommand:
     """Show what is in a log: sensors, units, rate, rests, what it can be used for, and which command to run next.
 
@@ -65,7 +66,7 @@ class InfoCommand:
     """
 
     logs: options.Logs
-    log: options.Reading = options.READING
+    log: options.LogOptions = options.READING
     as_json: options.JsonFlag = False
 
     def run(self) -> None:

@@ -11,13 +11,12 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
-
-from tyro.conf import arg
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from jaximu.cli import options
 from jaximu.cli.info import Use, describe, in_other_units, read_openly
 from jaximu.cli.messages import progress, say
+from jaximu.cli.options import switch, takes_options
 from jaximu.cli.usage import command_of
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
@@ -42,7 +41,7 @@ _RECORD = (
 )
 
 
-@dataclass(frozen=True)
+@takes_options
 class LogCommand(options.Fits):
     """Run all that LOGs allow, in one report: calibration, diagnosis, noise, temperature and more.
 
@@ -58,7 +57,7 @@ class LogCommand(options.Fits):
     """
 
     logs: options.Logs
-    yes: Annotated[bool, arg(help="Ask nothing: take the default for what the logs leave open, and say so.")] = False
+    yes: bool = switch("Ask nothing: take the default for what the logs leave open, and say so.")
 
     def run(self) -> None:
         """Do what the command line says."""

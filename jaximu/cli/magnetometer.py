@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from tyro.conf import UseAppendAction
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
-from jaximu.cli.options import option
+from jaximu.cli.options import option, takes_options
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
 from jaximu.ground.reexport import later
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _NEAR_THE_EQUATOR = 20.0  # degrees of latitude within which the field may point up or down
 
 
-@dataclass(frozen=True)
+@takes_options
 class MagnetometerCommand(options.Reads):
     """Calibrate a magnetometer while the unit is turned about: scale, hard and soft iron, alignment.
 
@@ -39,28 +39,22 @@ class MagnetometerCommand(options.Reads):
     """
 
     logs: options.Logs
-    mag_log: Annotated[
-        tuple[Path, ...],
-        UseAppendAction,
-        option("LOG", "The magnetometer's own file, if it is not in LOG; once per LOG."),
-    ] = ()
-    mag_columns: Annotated[str | None, option("NAMES", "Its columns in order, as for --columns.")] = None
+    mag_log: tuple[Path, ...] = option(
+        "LOG", "The magnetometer's own file, if it is not in LOG; once per LOG.", (), UseAppendAction
+    )
+    mag_columns: str | None = option("NAMES", "Its columns in order, as for --columns.")
     field: options.FieldText = None
-    longitude: Annotated[
-        float | None,
-        option("DEG", "With --latitude and --date: strength and dip of the World Magnetic Model, instead of --field."),
-    ] = None
-    calibration: Annotated[
-        Path | None,
-        option("FILE", "Calibration of accelerometer and gyroscope (default: estimated from LOG if possible)."),
-    ] = None
-    check: Annotated[Path | None, option("FILE", "Check whether this old calibration is still valid.")] = None
-    effect: Annotated[
-        tuple[str, ...],
-        UseAppendAction,
-        option("NAME[:onset=S]", "Also fit this effect: mag.lag, mag.temperature … May be repeated."),
-    ] = ()
-    traced: options.Traced = options.TRACED
+    longitude: float | None = option(
+        "DEG", "With --latitude and --date: strength and dip of the World Magnetic Model, instead of --field."
+    )
+    calibration: Path | None = option(
+        "FILE", "Calibration of accelerometer and gyroscope (default: estimated from LOG if possible)."
+    )
+    check: Path | None = option("FILE", "Check whether this old calibration is still valid.")
+    effect: tuple[str, ...] = option(
+        "NAME[:onset=S]", "Also fit this effect: mag.lag, mag.temperature … May be repeated.", (), UseAppendAction
+    )
+    traced: options.TraceOptions = options.TRACED
 
     def run(self) -> None:
         """Do what the command line says."""
@@ -105,7 +99,7 @@ class MagnetometerCommand(options.Reads):
 
 
 def _strength(
-    text: str | None, local: options.Local, longitude: float | None, trace: Json | None
+    text: str | None, local: options.GravityOptions, longitude: float | None, trace: Json | None
 ) -> FieldStrength | None:
     """Return the field as it was stated, or of the World Magnetic Model, or None where nothing is known."""
     if longitude is not None:

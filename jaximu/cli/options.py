@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar, dataclass_transform, get_type_hints
 
 from tyro.conf import Positional, Suppress, UseAppendAction, arg
 
@@ -36,40 +36,61 @@ if TYPE_CHECKING:
     from jaximu.recordings.segmentation import SegmentationOptions
 
 
-def option(metavar: str, text: str, **more: Any) -> Any:
-    """Return what an option is called in its help, and what it does; `more`: as for tyro's `arg`."""
-    return arg(metavar=metavar, help=text, **more)
+_TYRO = "tyro"
+"""Under which a field's metadata hold what tyro is to know of the option."""
+Kind = TypeVar("Kind", bound=type)
+
+
+def option(metavar: str, text: str, default: Any = None, *markers: Any, **more: Any) -> Any:
+    """Return the field of an option: what its value is called in the help, what it does, and its default.
+
+    `markers`, `more`: as tyro has them beside `arg` and in it.
+    """
+    return field(default=default, metadata={_TYRO: (arg(metavar=metavar or None, help=text, **more), *markers)})
+
+
+def switch(text: str, default: Any = False, *markers: Any, **more: Any) -> Any:
+    """Return the field of an option whose values need no name: a flag, or one of several words."""
+    return option("", text, default, *markers, **more)
+
+
+@dataclass_transform(frozen_default=True)
+def takes_options(kind: Kind) -> Kind:
+    """Make a class a frozen dataclass whose fields are options."""
+    made = dataclass(frozen=True)(kind)
+    hints = get_type_hints(made, include_extras=True)
+    for part in fields(made):
+        if _TYRO in part.metadata:
+            made.__annotations__[part.name] = Annotated[(hints[part.name], *part.metadata[_TYRO])]
+    return made
 
 
 Logs = Annotated[
     tuple[Path, ...],
     Positional,
-    option("LOG [LOG ...]", "Recordings of one unit, in any format that jaximu reads.", name="log"),
+    arg(metavar="LOG [LOG ...]", help="Recordings of one unit, in any format that jaximu reads.", name="log"),
 ]
-CalibrationFile = Annotated[Path, Positional, option("CALIBRATION", "A calibration.json that jaximu wrote.")]
+CalibrationFile = Annotated[Path, Positional, arg(metavar="CALIBRATION", help="A calibration.json that jaximu wrote.")]
 NoiseFile = Annotated[
     Path | None,
-    option(
-        "FILE",
-        "Noise that is known: an allan.json, a Kalibr imu.yaml, or a SPEC as `jaximu simulate` takes it.",
+    arg(
+        metavar="FILE",
+        help="Noise that is known: an allan.json, a Kalibr imu.yaml, or a SPEC as `jaximu simulate` takes it.",
         name="noise",
     ),
 ]
-DiagnosisFile = Annotated[
-    Path | None,
-    option("DIAGNOSIS.json", "Also allow for what the recording cannot see: causes as large as their limits."),
-]
+DIAGNOSIS = "DIAGNOSIS.json", "Also allow for what the recording cannot see: causes as large as their limits."
 LossChoice = Annotated[Literal["linear", "huber", "cauchy"], arg(help="Least squares, or robust against outliers.")]
 JsonFlag = Annotated[bool, arg(name="json", help="Print one JSON document on stdout, errors too.")]
 ForceFlag = Annotated[bool, arg(help="Replace results that would be lost: a calibration of other sensors in DIR.")]
 RepairFlag = Annotated[
     bool, arg(help="Repair lost samples, overflows and axes where possible; the notes say what was changed.")
 ]
-FieldText = Annotated[str | None, option("H[+-S]", "Field strength in µT, if known: 48.9 or 48.9+-0.2.")]
+FieldText = Annotated[str | None, arg(metavar="H[+-S]", help="Field strength in µT, if known: 48.9 or 48.9+-0.2.")]
 EffectNames = Annotated[
     tuple[str, ...],
     UseAppendAction,
-    option("NAME", "Also fit this effect; NAME+-SIGMA if its size is known to SIGMA. May be repeated."),
+    arg(metavar="NAME", help="Also fit this effect; NAME+-SIGMA if its size is known to SIGMA. May be repeated."),
 ]
 
 INERTIAL = ("accelerometer", "gyroscope")
@@ -82,61 +103,44 @@ _PLACEHOLDER = re.compile(r"(?<![\w/.-])CALIBRATION(_\d+)?(?![\w/.-])")
 _RATE = re.compile(r"[\d.]+ ?Hz")
 
 
-@dataclass(frozen=True)
+@takes_options
 class LogOptions:
     """How to read a log that does not say everything itself."""
 
     title: ClassVar[str] = "Reading"
-    gyro_log: Annotated[Path | None, option("LOG", "The gyroscope's own file, if it is not in LOG.")] = None
-    columns: Annotated[
-        str | None,
-        option(
-            "NAMES",
-            'Names of all columns in order, with units: "time [s],accel [m/s^2],gyro [rad/s]"; "_" skips a column. '
-            "Of several logs that differ, the names of each, with semicolons between them; none where its header does.",
-        ),
-    ] = None
-    gyro_columns: Annotated[str | None, option("NAMES", "The same for the gyroscope's file.")] = None
-    rate: Annotated[float | None, option("HZ", "Sample rate of a log without a time column.")] = None
-    axes: Annotated[
-        str | None,
-        option(
-            "MAP",
-            'Body axes: FLU, FRD or "y,-x,z"; one sensor: "accel=…;gyro=…"; add ";-f" if the '
-            "logger records minus specific force.",
-        ),
-    ] = None
-    accel_scale: Annotated[
-        str | None,
-        option(
-            "SCALE",
-            'Scale of raw counts: "16384 count/g" or "0.061 mg/count". A bare number from 1 up '
-            "is counts per m/s², below 1 m/s² per count.",
-        ),
-    ] = None
-    accel_offset: Annotated[str | None, option("COUNTS", "Counts at zero specific force, one number or three.")] = None
-    gyro_scale: Annotated[
-        str | None,
-        option(
-            "SCALE",
-            'Scale of raw counts: "131 count/(deg/s)". A bare number from 1 up is counts per '
-            "rad/s, below 1 rad/s per count.",
-        ),
-    ] = None
-    gyro_offset: Annotated[str | None, option("COUNTS", "Counts at zero rate, one number or three.")] = None
-    device: Annotated[
-        str | None,
-        option("ID", "Whose rows to take of a table in which several units write in turn; for array ID,ID,…."),
-    ] = None
-    topic: Annotated[
-        str | None,
-        option(
-            "TOPIC",
-            "Topic or message of a bag or flight log; A,B if the accelerometer and the gyroscope have one each.",
-        ),
-    ] = None
-    instance: Annotated[int | None, option("N", "Which of a flight log's sensors, from 0.")] = None
-    stamp: Annotated[str, option("{header,receive}", "Time of a message: the sensor's own or the logger's.")] = "header"
+    gyro_log: Path | None = option("LOG", "The gyroscope's own file, if it is not in LOG.")
+    columns: str | None = option(
+        "NAMES",
+        'Names of all columns in order, with units: "time [s],accel [m/s^2],gyro [rad/s]"; "_" skips a column. '
+        "Of several logs that differ, the names of each, with semicolons between them; none where its header does.",
+    )
+    gyro_columns: str | None = option("NAMES", "The same for the gyroscope's file.")
+    rate: float | None = option("HZ", "Sample rate of a log without a time column.")
+    axes: str | None = option(
+        "MAP",
+        'Body axes: FLU, FRD or "y,-x,z"; one sensor: "accel=…;gyro=…"; add ";-f" if the '
+        "logger records minus specific force.",
+    )
+    accel_scale: str | None = option(
+        "SCALE",
+        'Scale of raw counts: "16384 count/g" or "0.061 mg/count". A bare number from 1 up '
+        "is counts per m/s², below 1 m/s² per count.",
+    )
+    accel_offset: str | None = option("COUNTS", "Counts at zero specific force, one number or three.")
+    gyro_scale: str | None = option(
+        "SCALE",
+        'Scale of raw counts: "131 count/(deg/s)". A bare number from 1 up is counts per '
+        "rad/s, below 1 rad/s per count.",
+    )
+    gyro_offset: str | None = option("COUNTS", "Counts at zero rate, one number or three.")
+    device: str | None = option(
+        "ID", "Whose rows to take of a table in which several units write in turn; for array ID,ID,…."
+    )
+    topic: str | None = option(
+        "TOPIC", "Topic or message of a bag or flight log; A,B if the accelerometer and the gyroscope have one each."
+    )
+    instance: int | None = option("N", "Which of a flight log's sensors, from 0.")
+    stamp: str = option("{header,receive}", "Time of a message: the sensor's own or the logger's.", "header")
     like: Suppress[Any] = field(default=None, repr=False)  # no option: see `alike`
 
     def alike(self, calibration: Calibration | None) -> LogOptions:
@@ -236,12 +240,12 @@ class LogOptions:
         ]
 
 
-@dataclass(frozen=True)
+@takes_options
 class NoiseOptions:
     """What is known of the noise, by a recording or by a file that states it."""
 
     title: ClassVar[str] = "Options"
-    static: Annotated[Path | None, option("LOG", "A recording at rest, to measure noise and bias drift.")] = None
+    static: Path | None = option("LOG", "A recording at rest, to measure noise and bias drift.")
     noise: NoiseFile = None
 
     def value(self, log: LogOptions, gravity: LocalGravity) -> Recording | NoiseModel | None:
@@ -257,24 +261,20 @@ class NoiseOptions:
         return model_of(stated_noise(self.noise))
 
 
-@dataclass(frozen=True)
+@takes_options
 class GravityOptions:
     """Local gravity; by default standard gravity with the spread of gravity over the Earth."""
 
     title: ClassVar[str] = "Gravity"
-    gravity: Annotated[
-        str | None,
-        option(
-            "G[+-S]",
-            "Local gravity in m/s², with its standard deviation if known: 9.81744+-0.0005; a bare 9.81 is "
-            "known to half a unit of its last digit. Default: standard gravity, known to 0.015 m/s².",
-        ),
-    ] = None
-    latitude: Annotated[
-        float | None,
-        option("DEG", "Latitude, for gravity (WGS-84; with --gravity that one) and the Earth's rotation."),
-    ] = None
-    height: Annotated[float, option("M", "Height above sea level, with --latitude.")] = 0.0
+    gravity: str | None = option(
+        "G[+-S]",
+        "Local gravity in m/s², with its standard deviation if known: 9.81744+-0.0005; a bare 9.81 is "
+        "known to half a unit of its last digit. Default: standard gravity, known to 0.015 m/s².",
+    )
+    latitude: float | None = option(
+        "DEG", "Latitude, for gravity (WGS-84; with --gravity that one) and the Earth's rotation."
+    )
+    height: float = option("M", "Height above sea level, with --latitude.", 0.0)
 
     def value(self) -> LocalGravity:
         """Return the gravity that was asked for."""
@@ -284,16 +284,15 @@ class GravityOptions:
         return normal if self.gravity is None else replace(parse_gravity(self.gravity), latitude=normal.latitude)
 
 
-@dataclass(frozen=True)
+@takes_options
 class PoseOptions:
     """What counts as a pose."""
 
     title: ClassVar[str] = "Options"
-    threshold: Annotated[
-        float | None,
-        option("X", "A window is stationary below X times the noise floor's variance (default: found)."),
-    ] = None
-    minimum_duration: Annotated[float, option("S", "Shortest pose, in seconds.")] = 0.8
+    threshold: float | None = option(
+        "X", "A window is stationary below X times the noise floor's variance (default: found)."
+    )
+    minimum_duration: float = option("S", "Shortest pose, in seconds.", 0.8)
 
     def value(self) -> SegmentationOptions:
         """Return what the library asks for."""
@@ -302,21 +301,20 @@ class PoseOptions:
         return SegmentationOptions(threshold=self.threshold, minimum_duration=self.minimum_duration)
 
 
-@dataclass(frozen=True)
+@takes_options
 class TraceOptions:
     """Which unit it is and who calibrated it, kept in calibration.json; LOG.trace.toml is read where it is."""
 
     title: ClassVar[str] = "Traceability"
-    trace: Annotated[
-        Path | None,
-        option("FILE", "File with serial number, operator, references and more; `jaximu accept --explain` shows one."),
-    ] = None
-    serial: Annotated[str | None, option("TEXT", "Serial number of the unit.")] = None
-    lot: Annotated[str | None, option("TEXT", "Production lot.")] = None
-    operator: Annotated[str | None, option("TEXT", "Who calibrates.")] = None
-    station: Annotated[str | None, option("TEXT", "Where the unit is calibrated.")] = None
-    fixture: Annotated[str | None, option("TEXT", "What the unit is mounted in.")] = None
-    date: Annotated[str | None, option("DATE", "Date of the calibration, such as 2026-03-04.")] = None
+    trace: Path | None = option(
+        "FILE", "File with serial number, operator, references and more; `jaximu accept --explain` shows one."
+    )
+    serial: str | None = option("TEXT", "Serial number of the unit.")
+    lot: str | None = option("TEXT", "Production lot.")
+    operator: str | None = option("TEXT", "Who calibrates.")
+    station: str | None = option("TEXT", "Where the unit is calibrated.")
+    fixture: str | None = option("TEXT", "What the unit is mounted in.")
+    date: str | None = option("DATE", "Date of the calibration, such as 2026-03-04.")
 
     def value(self, logs: tuple[Path, ...]) -> Json | None:
         """Return what the file, the file beside the first log and the options say; None where nothing is said."""
@@ -329,12 +327,12 @@ class TraceOptions:
         return read_trace(path, stated) or None
 
 
-@dataclass(frozen=True)
+@takes_options
 class Results:
     """Where results go: to a folder, and to the terminal as prose or as one JSON document."""
 
     title: ClassVar[str] = "Output"
-    output: Annotated[Path | None, option("DIR", "Folder for the results and the report.", aliases=["-o"])] = None
+    output: Path | None = option("DIR", "Folder for the results and the report.", aliases=["-o"])
     as_json: JsonFlag = False
     force: ForceFlag = False
 
@@ -497,12 +495,6 @@ def effects_of(stated: tuple[str, ...]) -> Json:
     return {"effects": names, "effect_sigmas": sigmas}
 
 
-Reading = Annotated[LogOptions, arg(name="")]
-Local = Annotated[GravityOptions, arg(name="")]
-Poses = Annotated[PoseOptions, arg(name="")]
-Noise = Annotated[NoiseOptions, arg(name="")]
-Traced = Annotated[TraceOptions, arg(name="")]
-Output = Annotated[Results, arg(name="")]
 READING, LOCAL, NOISE = LogOptions(), GravityOptions(), NoiseOptions()
 POSES, TRACED, RESULTS = PoseOptions(), TraceOptions(), Results()
 
@@ -511,16 +503,16 @@ POSES, TRACED, RESULTS = PoseOptions(), TraceOptions(), Results()
 class Reads:
     """The options of every verb that reads logs: how, where on Earth they were recorded, and where results go."""
 
-    log: Reading = READING
-    local: Local = LOCAL
-    results: Output = RESULTS
+    log: LogOptions = READING
+    local: GravityOptions = LOCAL
+    results: Results = RESULTS
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fits(Reads):
     """The options of every verb that fits a unit to logs."""
 
-    noise: Noise = NOISE
+    noise: NoiseOptions = NOISE
 
 
 def require_files(*paths: Path | None) -> None:

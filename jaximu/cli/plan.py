@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import MISSING, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
-from jaximu.cli.options import option
+from jaximu.cli.options import option, switch, takes_options
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.planning import Known
 
 
-@dataclass(frozen=True)
+@takes_options
 class PlanCommand(options.Reads):
     """Plan which poses and turns to record next, to reduce the largest uncertainties.
 
@@ -34,34 +34,28 @@ class PlanCommand(options.Reads):
 
     """
 
-    source: Annotated[Path, Positional, option("CALIBRATION|LOG|SPEC", "What is known about the unit.")]
-    equipment: Annotated[
-        Literal["hands", "table", "dividing-head", "robot"],
-        arg(help="What turns the unit. robot: a robot, or anything whose attitude is tracked."),
-    ] = "hands"
-    purpose: Annotated[
-        Literal["fit", "filter"],
-        arg(name="for", help="What evaluates it. filter: a sequence of positions on a table, for `jaximu filter`."),
-    ] = "fit"
+    source: Path = option("CALIBRATION|LOG|SPEC", "What is known about the unit.", MISSING, Positional)
+    equipment: Literal["hands", "table", "dividing-head", "robot"] = switch(
+        "What turns the unit. robot: a robot, or anything whose attitude is tracked.", "hands"
+    )
+    purpose: Literal["fit", "filter"] = switch(
+        "What evaluates it. filter: a sequence of positions on a table, for `jaximu filter`.", "fit", name="for"
+    )
     effect: options.EffectNames = ()
-    poses: Annotated[int | None, option("N", "Number of poses (default: 12, and 19 positions for the filter).")] = None
-    turns: Annotated[int | None, option("N", "Number of turns of the table (default: as many as poses).")] = None
-    criterion: Annotated[
-        Literal["D", "A"], arg(help="What to minimise. D: the volume of the uncertainty; A: the mean variance.")
-    ] = "D"
-    parameter: Annotated[
-        str | None,
-        option("NAME", "Minimise the uncertainty of this parameter instead: accelerometer.gain[1,0]."),
-    ] = None
-    rest: Annotated[float | None, option("S", "Seconds at rest in each pose.")] = None
-    turn: Annotated[float | None, option("S", "Seconds of each turn.")] = None
-    fastest: Annotated[float | None, option("DEG/S", "Largest rate of the table or robot.")] = None
-    accuracy: Annotated[
-        float | None,
-        option("DEG", "Noise (1 σ, each axis) of the attitude that the robot or tracker reports."),
-    ] = None
-    step: Annotated[float | None, option("DEG", "Round angles to multiples of this.")] = None
-    seed: Annotated[int, option("N", "Random seed of the search.")] = 0
+    poses: int | None = option("N", "Number of poses (default: 12, and 19 positions for the filter).")
+    turns: int | None = option("N", "Number of turns of the table (default: as many as poses).")
+    criterion: Literal["D", "A"] = switch(
+        "What to minimise. D: the volume of the uncertainty; A: the mean variance.", "D"
+    )
+    parameter: str | None = option(
+        "NAME", "Minimise the uncertainty of this parameter instead: accelerometer.gain[1,0]."
+    )
+    rest: float | None = option("S", "Seconds at rest in each pose.")
+    turn: float | None = option("S", "Seconds of each turn.")
+    fastest: float | None = option("DEG/S", "Largest rate of the table or robot.")
+    accuracy: float | None = option("DEG", "Noise (1 σ, each axis) of the attitude that the robot or tracker reports.")
+    step: float | None = option("DEG", "Round angles to multiples of this.")
+    seed: int = option("N", "Random seed of the search.", 0)
 
     def run(self) -> None:
         """Do what the command line says."""
@@ -117,7 +111,7 @@ class PlanCommand(options.Reads):
         )
 
 
-def _known(path: Path, log: options.LogOptions, local: options.Local) -> tuple[Known | None, str | None]:
+def _known(path: Path, log: options.LogOptions, local: options.GravityOptions) -> tuple[Known | None, str | None]:
     """Tell by content what the argument is: calibration.json, a specification, else a log.
 
     Second, what its magnetometer lacks, where it has one; the first is None where it has nothing else.

@@ -6,15 +6,15 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import MISSING, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import UseAppendAction
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
-from jaximu.cli.options import option
+from jaximu.cli.options import option, switch, takes_options
 from jaximu.ground.errors import InputError, JaximuError
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ _EVERY = 0.5  # s of recording between two looks at it
 _LOG = "log.csv"
 
 
-@dataclass(frozen=True)
+@takes_options
 class RecordCommand(options.Reads):
     """Record with guidance: which way to hold the unit next, which poses count, and when it is enough.
 
@@ -45,30 +45,24 @@ class RecordCommand(options.Reads):
 
     """
 
-    source: Annotated[
-        str,
-        option(
-            "COMMAND|PORT|FILE|-",
-            "Where lines come from: a command's output, a serial port, a file to play again, or standard input.",
-            name="from",
-        ),
-    ]
-    baud: Annotated[int, option("N", "Speed of a serial port.")] = 115200
-    goal: Annotated[
-        tuple[str, ...],
-        UseAppendAction,
-        option(
-            "GOAL",
-            'Record until this standard uncertainty is reached, as "accelerometer.bias 0.2 mg" or '
-            '"gyroscope.scale 0.1 %"; may be repeated. Default: a dozen poses.',
-        ),
-    ] = ()
-    rest: Annotated[float, option("S", "How long a pose must rest to count, in seconds.")] = 4.0
-    page: Annotated[bool, arg(help="Also show the pose to take next, and what counts, on a page in the browser.")] = (
-        False
+    source: str = option(
+        "COMMAND|PORT|FILE|-",
+        "Where lines come from: a command's output, a serial port, a file to play again, or standard input.",
+        MISSING,
+        name="from",
     )
-    page_port: Annotated[int, option("N", "Port of the page, on this machine alone (default: one that is free).")] = 0
-    traced: options.Traced = options.TRACED
+    baud: int = option("N", "Speed of a serial port.", 115200)
+    goal: tuple[str, ...] = option(
+        "GOAL",
+        'Record until this standard uncertainty is reached, as "accelerometer.bias 0.2 mg" or '
+        '"gyroscope.scale 0.1 %"; may be repeated. Default: a dozen poses.',
+        (),
+        UseAppendAction,
+    )
+    rest: float = option("S", "How long a pose must rest to count, in seconds.", 4.0)
+    page: bool = switch("Also show the pose to take next, and what counts, on a page in the browser.")
+    page_port: int = option("N", "Port of the page, on this machine alone (default: one that is free).", 0)
+    traced: options.TraceOptions = options.TRACED
 
     def run(self) -> None:
         """Do what the command line says."""

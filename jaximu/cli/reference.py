@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import MISSING, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
-from jaximu.cli.options import option
+from jaximu.cli.options import option, takes_options
 from jaximu.ground.reexport import later
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from jaximu.recordings.recording import Recording
 
 
-@dataclass(frozen=True)
+@takes_options
 class ReferenceCommand(options.Fits):
     """Calibrate a unit against a measured attitude (optics, an inertial system, a robot) that has its own clock.
 
@@ -30,16 +30,13 @@ class ReferenceCommand(options.Fits):
 
     """
 
-    log_path: Annotated[Path, Positional, option("LOG", "The recording of the unit.", name="log")]
-    reference: Annotated[
-        Path | None,
-        option(
-            "REF",
-            "The reference: a table with time and quaternion, Euler angles, rotation vectors or a table's angles "
-            "(table_angle_z, table_angle_x …, outermost axis first), and velocity or position if known; LOG itself if "
-            "left out. Clocks, mounting and sense are found from the data.",
-        ),
-    ] = None
+    log_path: Path = option("LOG", "The recording of the unit.", MISSING, Positional, name="log")
+    reference: Path | None = option(
+        "REF",
+        "The reference: a table with time and quaternion, Euler angles, rotation vectors or a table's angles "
+        "(table_angle_z, table_angle_x …, outermost axis first), and velocity or position if known; LOG itself if "
+        "left out. Clocks, mounting and sense are found from the data.",
+    )
     effect: options.EffectNames = ()
     loss: options.LossChoice = "linear"
     repair: options.RepairFlag = False

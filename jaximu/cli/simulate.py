@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import inspect
 import json
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
-from jaximu.cli.options import option
+from jaximu.cli.options import option, switch, takes_options
 from jaximu.ground.errors import InputError
 from jaximu.ground.page import Code, Page, Section
 from jaximu.ground.reexport import later
 
 
-@dataclass(frozen=True)
+@takes_options
 class SimulateCommand:
     """Simulate recordings from a specification: motion, sensor, effects and noise.
 
@@ -31,13 +30,10 @@ class SimulateCommand:
 
     """
 
-    specification_file: Annotated[Path | None, Positional, option("SPEC", "TOML file; --explain describes it.")] = None
-    output: Annotated[
-        Path | None,
-        option("LOG", "Recording to write; the suffix sets the format.", name="output", aliases=["-o"]),
-    ] = None
-    protocols: Annotated[bool, arg(help="List the protocols with their keys and exit.")] = False
-    explain: Annotated[bool, arg(help="Describe the specification and exit.")] = False
+    specification_file: Path | None = option("SPEC", "TOML file; --explain describes it.", None, Positional)
+    output: Path | None = option("LOG", "Recording to write; the suffix sets the format.", aliases=["-o"])
+    protocols: bool = switch("List the protocols with their keys and exit.")
+    explain: bool = switch("Describe the specification and exit.")
     as_json: options.JsonFlag = False
 
     def run(self) -> None:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import UseAppendAction
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
-from jaximu.cli.options import option
+from jaximu.cli.options import option, switch, takes_options
 from jaximu.ground.errors import InputError
 from jaximu.ground.reexport import later
 
 
-@dataclass(frozen=True)
+@takes_options
 class ThermalCommand(options.Fits):
     """Fit bias over temperature from LOGs of a unit at rest while its temperature changes.
 
@@ -30,22 +29,16 @@ class ThermalCommand(options.Fits):
     """
 
     logs: options.Logs
-    calibration: Annotated[
-        Path | None, option("CALIBRATION", "Add the thermal part to this calibration of the unit.")
-    ] = None
-    block: Annotated[float | None, option("SECONDS", "Average over blocks this long (default: about 600 blocks).")] = (
-        None
-    )
-    to: Annotated[
-        tuple[Literal["px4", "ardupilot"], ...],
+    calibration: Path | None = option("CALIBRATION", "Add the thermal part to this calibration of the unit.")
+    block: float | None = option("SECONDS", "Average over blocks this long (default: about 600 blocks).")
+    to: tuple[Literal["px4", "ardupilot"], ...] = switch(
+        "Also write an autopilot's parameters into DIR, and report what they lose. May be repeated.",
+        (),
         UseAppendAction,
-        arg(help="Also write an autopilot's parameters into DIR, and report what they lose. May be repeated."),
-    ] = ()
-    sensor: Annotated[
-        int | None, option("N", "The sensor's number on the autopilot: 0 to 3 for PX4, 1 to 3 for ArduPilot.")
-    ] = None
-    accel_id: Annotated[int, option("ID", "PX4's device ID of the accelerometer.")] = 0
-    gyro_id: Annotated[int, option("ID", "PX4's device ID of the gyroscope.")] = 0
+    )
+    sensor: int | None = option("N", "The sensor's number on the autopilot: 0 to 3 for PX4, 1 to 3 for ArduPilot.")
+    accel_id: int = option("ID", "PX4's device ID of the accelerometer.", 0)
+    gyro_id: int = option("ID", "PX4's device ID of the gyroscope.", 0)
 
     def run(self) -> None:
         """Do what the command line says."""

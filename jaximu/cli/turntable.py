@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import UseAppendAction
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
-from jaximu.cli.options import option
+from jaximu.cli.options import option, switch, takes_options
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jaximu.recordings.recording import Recording
 
 
-@dataclass(frozen=True)
+@takes_options
 class TurntableCommand(options.Fits):
     """Calibrate a unit on a rate table, a dividing head or in known positions.
 
@@ -33,30 +33,26 @@ class TurntableCommand(options.Fits):
     """
 
     logs: options.Logs
-    reference: Annotated[
-        tuple[Path, ...],
+    reference: tuple[Path, ...] = option(
+        "REF",
+        "A schedule (CSV), named sections (JSON, or a column part), or a file with "
+        "reference columns; once for each LOG. Without it the log's own reference columns are used.",
+        (),
         UseAppendAction,
-        option(
-            "REF",
-            "A schedule (CSV), named sections (JSON, or a column part), or a file with "
-            "reference columns; once for each LOG. Without it the log's own reference columns are used.",
-        ),
-    ] = ()
-    fit: Annotated[
-        tuple[str, ...],
+    )
+    fit: tuple[str, ...] = option(
+        "EFFECT",
+        "Also fit this effect, such as setup.table_tilt or accel.quadratic. May be repeated.",
+        (),
         UseAppendAction,
-        option("EFFECT", "Also fit this effect, such as setup.table_tilt or accel.quadratic. May be repeated."),
-    ] = ()
-    earth_rotation: Annotated[
-        Literal["known", "fit"] | None,
-        arg(
-            help="Earth rotation: known from --latitude and the headings (x east, y north), or fitted "
-            "(default: not modelled)."
-        ),
-    ] = None
+    )
+    earth_rotation: Literal["known", "fit"] | None = switch(
+        "Earth rotation: known from --latitude and the headings (x east, y north), or fitted (default: not modelled).",
+        None,
+    )
     loss: options.LossChoice = "linear"
     repair: options.RepairFlag = False
-    traced: options.Traced = options.TRACED
+    traced: options.TraceOptions = options.TRACED
 
     def run(self) -> None:
         """Do what the command line says."""

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import MISSING
 from pathlib import Path
-from typing import Annotated
 
 from tyro.conf import Positional
 
 from jaximu.cli import options
-from jaximu.cli.options import option
+from jaximu.cli.options import option, takes_options
 from jaximu.ground.page import Page, Table
 from jaximu.ground.reexport import later
 
 
-@dataclass(frozen=True)
+@takes_options
 class VerifyCommand:
     """Check a calibration.json or an acceptance.json, and every file behind it, against the hashes they carry.
 
@@ -26,12 +25,10 @@ class VerifyCommand:
 
     """
 
-    documents: Annotated[
-        tuple[Path, ...],
-        Positional,
-        option("DOCUMENT [DOCUMENT ...]", "calibration.json or acceptance.json.", name="documents"),
-    ]
-    folder: Annotated[Path | None, option("DIR", "Look for moved recordings here, too.")] = None
+    documents: tuple[Path, ...] = option(
+        "DOCUMENT [DOCUMENT ...]", "calibration.json or acceptance.json.", MISSING, Positional
+    )
+    folder: Path | None = option("DIR", "Look for moved recordings here, too.")
     as_json: options.JsonFlag = False
 
     def run(self) -> None:
