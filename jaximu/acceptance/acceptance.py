@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -235,12 +235,11 @@ def _record(calibration: Calibration, units: Units, slope: FloatArray) -> str:
 # --- noise ------------------------------------------------------------------------------------------------------------
 
 
-def _noise_items(limit: Limit, rule: Rule, noise: Mapping[str, Any] | None) -> list[Item]:
-    items = []
+def _noise_items(limit: Limit, rule: Rule, noise: Mapping[str, Any] | None) -> Iterator[Item]:
     for axis in limit.axes or range(3):
         name, (reason, advice, term) = f"{limit.owner}.{limit.part}[{axis}]", _noise_term(limit, axis, noise)
         if reason:
-            items.append(Item.of(limit, name, reason=reason, advice=advice))
+            yield Item.of(limit, name, reason=reason, advice=advice)
             continue
         value, low, high = (float(term[key]) for key in _TERM)
         sigma = (high - low) / (2 * Z95)
@@ -249,8 +248,7 @@ def _noise_items(limit: Limit, rule: Rule, noise: Mapping[str, Any] | None) -> l
         if judged["verdict"] == UNDECIDED:
             needed = limit.nearest(value) / float(rule.multiple())
             advice = f"Record about {max(1.1, (sigma / needed) ** 2):.2g} times as long at rest."
-        items.append(Item.of(limit, name, **judged, recording=sigma, advice=advice))
-    return items
+        yield Item.of(limit, name, **judged, recording=sigma, advice=advice)
 
 
 def _noise_term(limit: Limit, axis: int, noise: Mapping[str, Any] | None) -> tuple[str, str, Mapping[str, Any]]:

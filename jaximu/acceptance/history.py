@@ -9,7 +9,7 @@ is its drift (`jaximu.acceptance.trend`), and which says when a limit's guard ba
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date, timedelta
 from typing import Any
@@ -138,9 +138,8 @@ class UnitHistory(Result, Document, page="history"):
     @property
     def moved(self) -> tuple[Movement, ...]:
         """The numbers that moved, the surest first."""
-        return tuple(
-            sorted((movement for movement in self.movements if movement.moved), key=lambda movement: movement.p_value)
-        )
+        surest = sorted(self.movements, key=lambda movement: movement.p_value)
+        return tuple(movement for movement in surest if movement.moved)
 
     @property
     def verdict(self) -> str:
@@ -283,12 +282,12 @@ def _comparable(epochs: Sequence[Epoch]) -> tuple[list[str], list[str]]:
 
     Raises `NotPossibleError` where there is none.
     """
-    reasons = [_apart(epochs[0], epoch) for epoch in epochs[1:]]
-    apart = {owner: reason for part in reasons for owner, reason in part.items()}
-    everything = list(dict.fromkeys(name for epoch in epochs for name in epoch.quantities))
+    apart = {}
+    for epoch in epochs[1:]:
+        apart |= _apart(epochs[0], epoch)
     names = []
     left_out = {}
-    for name in everything:
+    for name in dict.fromkeys(name for epoch in epochs for name in epoch.quantities):
         stem = name.partition("[")[0]
         owner = owner_of(name)
         lacking = [epoch.file for epoch in epochs if name not in epoch.quantities]
@@ -379,7 +378,6 @@ def _courses(
     for index, name in enumerate(names):
         values = np.array([epoch.quantities[name].value for epoch in epochs])
         part = covariance[index :: len(names), index :: len(names)]
-        variance = part[0, 0] + part[-1, -1] - 2 * part[0, -1]
         movements.append(
             Movement(
                 name,
@@ -388,7 +386,7 @@ def _courses(
                 tuple(epoch.sigma(name) for epoch in epochs),
                 tuple(epoch.sigma(name, len({other.gravity for other in epochs}) > 1) for epoch in epochs),
                 float(values[-1] - values[0]),
-                float(np.sqrt(variance)),
+                float(np.sqrt(part[0, 0] + part[-1, -1] - 2 * part[0, -1])),
                 sameness(values[:, None], part).p_value,
                 StraightLine.through(times, values, part),
                 not name.startswith("gyroscope.bias"),
@@ -540,42 +538,37 @@ def _limits_reached(
     return tuple(reached), unknown
 
 
-def _notes(epochs: Sequence[Epoch], nominal: Scales) -> list[str]:
-    notes = [
-        f"the {name} was logged in counts: its scale and bias are relative to the first calibration's."
-        for name, triad in epochs[0].calibration.triads().items()
-        if triad.output_unit == "count" and name not in nominal
-    ]
+def _notes(epochs: Sequence[Epoch], nominal: Scales) -> Iterator[str]:
+    for name, triad in epochs[0].calibration.triads().items():
+        if triad.output_unit == "count" and name not in nominal:
+            yield f"the {name} was logged in counts: its scale and bias are relative to the first calibration's."
     if len(epochs) == 2:
-        notes.append("two calibrations cannot distinguish a steady drift from a single jump.")
+        yield "two calibrations cannot distinguish a steady drift from a single jump."
     serials = {str((epoch.calibration.trace or {}).get("serial", "")) for epoch in epochs} - {""}
     if len(serials) > 1:
-        notes.append(f"the calibrations state different serial numbers, {listed(sorted(serials))}: is it one unit?")
+        yield f"the calibrations state different serial numbers, {listed(sorted(serials))}: is it one unit?"
     if any(epoch.turned for epoch in epochs):
-        notes.append(
+        yield (
             "axes of a set-up were turned to the accelerometer's own, so that the unit may sit another way each time."
         )
     if all("accelerometer" not in epoch.calibration.triads() for epoch in epochs):
-        notes.append("without an accelerometer axes are the set-up's: a unit that sits turned has other misalignments.")
+        yield "without an accelerometer axes are the set-up's: a unit that sits turned has other misalignments."
     effects = [
         {e.name for e in epoch.calibration.imu.all_effects().values() if e.scope == "device"} for epoch in epochs
     ]
     if odd := sorted(set.union(*effects) - set.intersection(*effects)):
-        notes.append(
-            f"not all calibrations have {listed(odd)}: gain and bias that were fitted without it hold a part of it."
-        )
+        yield f"not all calibrations have {listed(odd)}: gain and bias that were fitted without it hold a part of it."
     stated = {epoch.gravity for epoch in epochs}
     if len(stated) < len(epochs) and any(epoch.by_gravity.any() for epoch in epochs):
         sigma = max(gravity.sigma / gravity.value for gravity in stated)
-        notes.append(
+        yield (
             "gravity's error is common to calibrations that state the same gravity; were they made at different "
             f"places, all scales of the accelerometer might differ by {100 * 2 * np.sqrt(2) * sigma:.2g} %."
         )
     known = [epoch.temperature for epoch in epochs if epoch.temperature is not None]
     constant = not any(over_temperature(epoch.calibration) for epoch in epochs)
     if constant and len(known) == len(epochs) and max(known) > min(known):
-        notes.append(
+        yield (
             f"the recordings were at {min(known):.1f} to {max(known):.1f} °C: what follows temperature looks like "
             "movement."
         )
-    return notes

@@ -39,6 +39,7 @@ from typing import Any
 import numpy as np
 
 from jaximu.acceptance.decision import Rule, probability_of_conformity
+from jaximu.acceptance.words import between
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import Json, file_digest, read_toml
 from jaximu.ground.errors import FilePath, InputError, only
@@ -92,6 +93,10 @@ class Limit:
     def stem(self) -> str:
         """What the names of its quantities begin with: `gyroscope.bias`, or an effect's name."""
         return self.part if "." in self.part else f"{self.owner}.{self.part}"
+
+    def words(self) -> str:
+        """Say between which values the quantity must lie."""
+        return between(self.low, self.high, self.unit, self.stated)
 
     def nearest(self, value: float) -> float:
         """Return how far a value is from the nearer bound."""
@@ -170,8 +175,7 @@ def _limit(key: str, stated: Any, source: str, where: str) -> Limit:
         raise InputError(
             f"{where}: the limits contradict each other: the lower, {low:g}, is not below {high:g} {base}."
         )
-    over = 0.0
-    temperature = None
+    over, after, temperature = 0.0, 0.0, None
     if part in OUTPUTS:
         if "over" not in entry:
             raise InputError(f'{where}: say up to which input the output is limited: over = "1 g" (or "300 deg/s").')
@@ -180,7 +184,6 @@ def _limit(key: str, stated: Any, source: str, where: str) -> Limit:
             temperature = _range(entry["temperature"], f"{where}.temperature")
     elif "over" in entry or "temperature" in entry:
         raise InputError(f"{where}: `over` and `temperature` belong to limits of an output.")
-    after = 0.0
     if owner == "navigation":
         if "after" not in entry:
             raise InputError(f'{where}: say after how long the {part} is limited: after = "60 s".')

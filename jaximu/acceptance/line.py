@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -157,16 +157,12 @@ class Line(Result, Document, page="line"):
 
     def missed(self, row: int) -> list[str]:
         """Return the items that a calibrated unit (by its place among these) does not pass."""
-        if self.judged is None:
-            return []
-        return [
-            name for name, verdict in zip(self.judged.names, self.judged.verdict[row], strict=True) if verdict != PASS
-        ]
+        judged = self.judged
+        return [] if judged is None else [judged.names[at] for at in np.flatnonzero(judged.verdict[row] != PASS)]
 
     def items(self, most: int = _SHOWN_ITEMS) -> list[tuple[str, Item]]:
         """Return device and item of what does not pass, failed ones and least probable ones first, so many at most."""
-        judged = self.judged
-        if judged is None:
+        if (judged := self.judged) is None:
             return []
         worst_first = np.lexsort([judged.probability.ravel(), (judged.verdict != FAIL).ravel()])
         kept = worst_first[(judged.verdict != PASS).ravel()[worst_first]][:most]
@@ -335,8 +331,7 @@ def _in_counts(table: Batch, nominal: Scales) -> dict:
 def _first_recordings(table: Batch) -> IntArray:
     """Return the place of each device's first recording, by date, in the order of the dates; undated ones come last."""
     order = np.where(np.isnan(table.days), np.inf, table.days).argsort(kind="stable")
-    first = np.unique(np.array(table.devices)[order], return_index=True)[1]
-    return order[np.sort(first)]
+    return order[np.sort(np.unique(np.array(table.devices)[order], return_index=True)[1])]
 
 
 # --- the line ---------------------------------------------------------------------------------------------------------
@@ -413,8 +408,7 @@ def _alarms(
     course: Drift | None,
     golden: str,
     questions: int,
-) -> list[Alarm]:
-    alarms = []
+) -> Iterator[Alarm]:
     for station, (chart, places) in charts.items():
         what = spoken(name) + (f" at station {station}" if station else "")
         off = np.abs(chart.average - chart.centre)
@@ -426,7 +420,7 @@ def _alarms(
                 f"{what}: the moving average left its limits at {_when(table, int(places[start]))} and is farthest, ",
                 f" {side} the mean of all, at {_when(table, int(places[most]))}",
             )
-            alarms.append(Alarm("average", name, station, texts, ((float(off[most]), 3),)))
+            yield Alarm("average", name, station, texts, ((float(off[most]), 3),))
         # a value far off is a jump, too: it is said once
         kind, hits = ("value", chart.beyond) if len(chart.beyond) else ("jump", chart.jumps)
         if len(hits):
@@ -436,12 +430,11 @@ def _alarms(
             relation = "is off the mean by" if kind == "value" else "differs from the unit before by"
             more = f"; {len(hits) - 1} more units are beyond the limits" if len(hits) > 1 else ""
             texts = (f"{what}: {_when(table, int(places[most]))} {relation} ", more)
-            alarms.append(Alarm(kind, name, station, texts, ((float(away[most]), 3),)))
+            yield Alarm(kind, name, station, texts, ((float(away[most]), 3),))
     if course is not None and course.p_value * questions < LEVEL:
         texts = (f"{spoken(name)} of the golden unit {golden} drifts by ", " in 30 days (± ", ", 95 %)")
         amounts = ((30 * course.slope, 3), (30 * Z95 * course.sigma, 2))
-        alarms.append(Alarm("golden", name, "", texts, amounts))
-    return alarms
+        yield Alarm("golden", name, "", texts, amounts)
 
 
 def _groups(labels: Sequence[str], first: IntArray) -> dict[str, IntArray]:
@@ -460,9 +453,8 @@ def _compared(
     values: FloatArray,
     first: IntArray,
     questions: int,
-) -> list[Alarm]:
+) -> Iterator[Alarm]:
     """Name the stations or lots whose units (first,) differ from the others', the surest first."""
-    alarms = []
     left = dict(groups)
     while len(left) > 1:
         shifts = {
@@ -475,9 +467,8 @@ def _compared(
             break
         verb = "measures" if kind == "station" else "has"
         than = f" {'more' if shift > 0 else 'less'} than the other {kind}s"
-        alarms.append(Alarm(kind, name, label, (f"{kind} {label} {verb} {spoken(name)} ", than), ((abs(shift), 3),)))
+        yield Alarm(kind, name, label, (f"{kind} {label} {verb} {spoken(name)} ", than), ((abs(shift), 3),))
         del left[label]  # those that remain are compared without it
-    return alarms
 
 
 def _shift(values: FloatArray, inside: BoolArray, all_of: BoolArray) -> tuple[float, float]:

@@ -67,8 +67,7 @@ def _item(
     limit: Limit, name: str, rule: Rule, recording: float, gravity: float, noise: float, gravity_sigma: float
 ) -> Item:
     """Return the item of an error about zero with these standard deviations; gravity_sigma: m/s²."""
-    sigma = float(np.sqrt(recording**2 + gravity**2 + noise**2))
-    judged = limit.judged(rule, 0.0, sigma)
+    judged = limit.judged(rule, 0.0, float(np.sqrt(recording**2 + gravity**2 + noise**2)))
     advice = ""
     if judged["verdict"] == UNDECIDED:
         needed = limit.nearest(0.0) / float(normal_isf(rule.risk / 2))  # both sides of zero count, hence half the risk

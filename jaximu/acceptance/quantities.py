@@ -14,7 +14,7 @@ the whole ν = (n − p) u⁴ / (s u²_recording)² (Welch and Satterthwaite, GU
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -138,13 +138,11 @@ def measure(units: Units, nominal: Scales, outputs: Sequence[Limit]) -> Measured
         for (limit, _), stimulus in zip(ranges, stimuli, strict=True):
             error = _error_of_output(limit, like, flat, scales, stimulus)
             value, slope = error(flat), jax.jacfwd(error)(flat)  # (points, 3), (points, 3, m)
-            sigma = _sigma(slope[..., indices], covariance)
-            worst = jnp.argmax(jnp.abs(value) + 2 * sigma, axis=0)
+            worst = jnp.argmax(jnp.abs(value) + 2 * _sigma(slope[..., indices], covariance), axis=0)
             parts.append((value[worst, jnp.arange(3)], slope[worst, jnp.arange(3)]))
         value, slope = (jnp.concatenate(column) for column in zip(*parts, strict=True))
         free = slope[:, indices]
-        by_gravity = jnp.abs(slope @ jnp.where(of_gravity, flat, 0.0)) * gravity
-        return value, _sigma(free, covariance), by_gravity, free
+        return value, _sigma(free, covariance), jnp.abs(slope @ jnp.where(of_gravity, flat, 0.0)) * gravity, free
 
     stimuli = [stimulus for _, stimulus in ranges]
     description = f"accept {indices.tolist()} {[(limit.part, limit.owner) for limit, _ in ranges]}"
@@ -159,14 +157,13 @@ def measure(units: Units, nominal: Scales, outputs: Sequence[Limit]) -> Measured
     names = (*_parameter_names(units.like), *(f"{limit.key}[{axis}]" for limit, _ in ranges for axis in range(3)))
     sizes = flatten(typical_sizes(unflatten(units.like, np.median(units.numbers, axis=0))))[indices]
     open_ = sigmas_of(units.covariance) > UNDETERMINED * sizes
-    determined = ~((np.abs(slope) > 0) & open_[:, None]).any(axis=2)
     return Measured(
         names,
         value,
         sigma,
         gravity,
         _freedom(units, names, sigma, gravity),
-        determined,
+        ~((np.abs(slope) > 0) & open_[:, None]).any(axis=2),
         np.all(slope == 0, axis=(0, 2)),
         slope,
     )
@@ -183,13 +180,12 @@ def _parameters(triad, scale, offset):
     return jnp.concatenate([(triad.bias - offset) / diagonal, diagonal / scale - 1, crossed])
 
 
-def _parameter_names(imu: Imu) -> list[str]:
-    names = []
+def _parameter_names(imu: Imu) -> Iterator[str]:
     for owner in imu.triads():
-        names += [f"{owner}.{part}[{axis}]" for part in ("bias", "scale") for axis in range(3)]
-        names += [f"{owner}.misalignment[{i},{j}]" for i in range(3) for j in range(3) if i != j]
-    effects = [effect for triad in imu.triads().values() for effect in triad.effects]
-    return names + [f"{effect.name}[{k}]" for effect in effects for k in range(effect.size)]
+        yield from (f"{owner}.{part}[{axis}]" for part in ("bias", "scale") for axis in range(3))
+        yield from (f"{owner}.misalignment[{i},{j}]" for i in range(3) for j in range(3) if i != j)
+    for triad in imu.triads().values():
+        yield from (f"{effect.name}[{k}]" for effect in triad.effects for k in range(effect.size))
 
 
 def output_stimulus(limit: Limit, imu: Imu) -> Stimulus:

@@ -46,11 +46,8 @@ def state_of(path: FilePath) -> str:
 def _links(path: Path, folders: list[Path], what: str, expected: str | None = None) -> Iterator[Link]:
     document = read_document(path, None, "a calibration.json or an acceptance.json")
     stated = document.get("digest")
-    if stated is None:
-        state = UNSEALED
-    else:
-        state = INTACT if stated == digest(document) and expected in (None, stated) else CHANGED
-    yield Link(what, str(path), state)
+    sealed = INTACT if stated == digest(document) and expected in (None, stated) else CHANGED
+    yield Link(what, str(path), UNSEALED if stated is None else sealed)
     calibration = document.get("calibration")
     if isinstance(calibration, dict) and calibration.get("digest"):
         file = _find(str(calibration["file"]), folders)

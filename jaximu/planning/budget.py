@@ -163,11 +163,15 @@ class Budget(Result, Document, page="budget"):
         return np.sqrt(np.sum(self.sigma**2, axis=0))
 
     @property
+    def shares(self) -> FloatArray:
+        """Each source's share (s, p) of each parameter's variance, to first order."""
+        return self.sigma**2 / np.maximum(np.sum(self.sigma**2, axis=0), 1e-300)
+
+    @property
     def off(self) -> FloatArray:
         """Share (s, p) by which a parameter's total is wrong because the source's first order is."""
         total = self.total
-        changed = root_or_zero(total**2 - self.sigma**2 + self.actual**2)
-        return changed / np.where(total > 0, total, 1.0) - 1
+        return root_or_zero(total**2 - self.sigma**2 + self.actual**2) / np.where(total > 0, total, 1.0) - 1
 
     def nonlinear(self) -> list[tuple[int, int]]:
         """Return (source, parameter) where the first order is off by more than 5 % of the total."""
@@ -175,9 +179,7 @@ class Budget(Result, Document, page="budget"):
 
     def order(self) -> list[int]:
         """Return the sources, dominant first: by their mean share of the parameters' variances."""
-        share = self.sigma**2 / np.maximum(np.sum(self.sigma**2, axis=0), 1e-300)
-        weight = share[:, self.determined].sum(axis=1)
-        return [int(row) for row in (-weight).argsort(kind="stable")]
+        return [int(row) for row in (-self.shares[:, self.determined].sum(axis=1)).argsort(kind="stable")]
 
     def document(self) -> Json:
         """Return the budget as the JSON document of schema `jaximu.budget/1`."""
@@ -197,12 +199,12 @@ class Budget(Result, Document, page="budget"):
                 if self.check is not None:
                     entry["monte_carlo"] = float(self.check.rms[index])
             parameters.append(entry)
-        sources = [self.sources[row] for row in order]
         return {
             "schema": SCHEMA,
             **entries(self, "source", "protocol", "open", "notes"),
             "sources": [
-                entries(source, "name", "words", "size", "unit") | {"sigma": source.value} for source in sources
+                entries(self.sources[row], "name", "words", "size", "unit") | {"sigma": self.sources[row].value}
+                for row in order
             ],
             "parameters": parameters,
             "goals": [goal.document() for goal in self.goals],

@@ -19,7 +19,6 @@ def in_chunks(function: Callable[..., Any], size: int, *trees: Any) -> Any:
     count = len(jax.tree.leaves(trees)[0])
     results = []
     for start in range(0, count, size):
-        rows = np.minimum(np.arange(start, start + size), count - 1)
-        result = function(*part_of(trees, rows))
+        result = function(*part_of(trees, np.minimum(np.arange(start, start + size), count - 1)))
         results.append(part_of(result, slice(count - start)))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *results)

@@ -8,7 +8,7 @@ all parameters alike (the D-criterion) where there is none.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -129,7 +129,7 @@ class Guide:
             self._seen = taken
             self._renew(recording)
         short = float(length[-1]) if len(rests) and not long[-1] and not still else 0.0
-        goals = self._goals(recording)
+        goals = tuple(self._goals())
         done = all(goal.reached for goal in goals) if goals else len(taken) >= _USUAL
         done = (done and self._calibration is not None) or len(taken) >= _MOST
         words = "" if self._next is None else box_words(self._next)
@@ -138,9 +138,7 @@ class Guide:
             0
         ]
         wanted = 0 if goals else _USUAL
-        return Moment(
-            still, taken, short, self._next, words, tuple(goals), done, self._calibration, held, self._ups, wanted
-        )
+        return Moment(still, taken, short, self._next, words, goals, done, self._calibration, held, self._ups, wanted)
 
     def _renew(self, recording: Recording) -> None:
         if len(self._seen) >= _FEWEST:
@@ -186,17 +184,15 @@ class Guide:
             total += np.sum((now / size) ** 4)  # the largest counts most; where it cannot be helped at once, the others
         return float(np.log(total))
 
-    def _goals(self, recording: Recording) -> list[GoalProgress]:
-        progress = []
+    def _goals(self) -> Iterator[GoalProgress]:
         calibration = self._calibration
         for text, what, size in self.goals:
-            if calibration is None:
-                progress.append(GoalProgress(text, 0.0, np.inf))
-                continue
-            sigma = sigmas_of(calibration.covariance)
-            wanted, now = goal_sigmas(what, size, calibration.names, calibration.imu, sigma)
-            progress.append(GoalProgress(text, wanted, float(now.max())))
-        return progress
+            wanted, now = 0.0, np.inf
+            if calibration is not None:
+                sigma = sigmas_of(calibration.covariance)
+                wanted, sigmas = goal_sigmas(what, size, calibration.names, calibration.imu, sigma)
+                now = float(sigmas.max())
+            yield GoalProgress(text, wanted, now)
 
 
 def _upward(imu: Imu, signal: Signal, rows: IntArray) -> FloatArray:

@@ -145,9 +145,8 @@ class Known:
         observations = calibration.observations
         if observations is None:
             return replace(known, excess=_left_over(calibration))
-        poses = observations.poses
         turns = observations.turns
-        poses = part_of(poses, np.asarray(poses.mask))
+        poses = part_of(observations.poses, np.asarray(observations.poses.mask))
         noise = np.asarray(turns.noise)
         turned = np.asarray(turns.interval)[np.asarray(turns.mask)]
         density = np.mean(poses.accelerometer_covariance * (poses.stop - poses.start)[:, None, None], axis=0)
@@ -186,8 +185,7 @@ def _left_over(calibration: Calibration) -> tuple[float, float, float]:
     Its rms, in SI, is all that a file tells; the conditions that the parameters took up are made up for.
     """
     left = {name: after for name, (_, after, _) in calibration.rms.items()}
-    poses = calibration.data.get("poses", 0)
-    turns = calibration.data.get("turns", 0)
+    poses, turns = (calibration.data.get(name, 0) for name in ("poses", "turns"))
     scale = {name: float(np.trace(triad.gain @ triad.gain.T)) for name, triad in calibration.triads().items()}
     rotation = scale.get("gyroscope", 0.0)
     if "specific_force" in left:  # with equipment: vectors of three components, twelve parameters a triad
@@ -359,8 +357,7 @@ def propose(
     exact, design, best, classical = _searched(question, poses, turns, equipment, seed, report)
     if classical:
         notes += ("well known positions do as well as any here, and are proposed.",)
-    names = question.parameters.names
-    size = question.parameters.size
+    names, size = question.parameters.names, question.parameters.size
     prior = np.linalg.inv(question.prior) + np.outer(question.by_gravity, question.by_gravity)
     # what the data sheet adds is none of the data's: it must not hide a direction that no pose tells
     root = root_of(best.information + question.prior - np.eye(len(size)) / TOLERANCE**2)
@@ -468,8 +465,7 @@ def _coarsened(question: DesignQuestion) -> DesignQuestion:
 
 def _plannable(imu: Imu) -> tuple[Imu, tuple[str, ...]]:
     """The unit with its effects dormant, but for those that poses and turns do not excite or that do not last."""
-    dormant = []
-    notes = []
+    dormant, notes = [], []
     for effect in (effect for triad in imu.triads().values() for effect in triad.effects):
         if effect.scope == "device" and set(effect.needs) <= set(STIMULI) and not effect.memory:
             dormant.append(CATALOGUE[effect.name].dormant(**{key: getattr(effect, key) for key in effect.inner}))
@@ -483,8 +479,7 @@ def _in_output(triad: Triad, density: FloatArray) -> FloatArray:
 
 
 def _accuracy(known: Known, imu: Imu, equipment: Equipment) -> tuple[Accuracy, tuple[str, ...]]:
-    notes = []
-    densities = []
+    notes, densities = [], []
     figures = {
         "accelerometer": (ACCELEROMETER_DENSITY, "100 µg/√Hz", known.accelerometer_noise),
         "gyroscope": (GYROSCOPE_DENSITY, "0.005 °/s/√Hz", known.gyroscope_noise),
@@ -500,17 +495,13 @@ def _accuracy(known: Known, imu: Imu, equipment: Equipment) -> tuple[Accuracy, t
         densities.append(density)
     rest = [density / equipment.rest for density in densities]
     white = np.trace(rest[0]), np.trace(densities[1]) * equipment.turn, np.trace(rest[1])
-    excess = np.array([extra / noise for extra, noise in zip(known.excess, white, strict=True)])
-    attitude = np.asarray(np.radians(equipment.accuracy or 0.0))
-    return Accuracy(
-        rest[0], rest[1], densities[1], excess, np.asarray(equipment.turn), np.asarray(equipment.rest), attitude
-    ), tuple(notes)
+    turn, still, attitude = map(np.asarray, (equipment.turn, equipment.rest, np.radians(equipment.accuracy or 0.0)))
+    return Accuracy(rest[0], rest[1], densities[1], np.array(known.excess) / white, turn, still, attitude), tuple(notes)
 
 
 def _prior(known: Known, imu: Imu, parameters: Parameters, by_gravity: FloatArray) -> FloatArray:
     """Information (typical sizes) about the parameters, gravity known: the calibration's, else the data sheet's."""
-    names = parameters.names
-    size = parameters.size
+    names, size = parameters.names, parameters.size
     total = TOLERANCE**2 * np.eye(len(names))
     if known.covariance is not None:
         upper = [index for index, name in enumerate(names) if name in _UPPER]
@@ -625,8 +616,7 @@ def _attitudes(up: FloatArray, heading: FloatArray | float = 0.0) -> FloatArray:
 
 def _neighbourly(attitudes: FloatArray) -> FloatArray:
     """Attitudes in which neighbours have one sign: the shortest way leads from one to the next."""
-    signs = np.where(dot_rows(attitudes[1:], attitudes[:-1]) >= 0, 1.0, -1.0)
-    return attitudes * np.cumprod([1.0, *signs])[:, None]
+    return attitudes * np.cumprod([1.0, *np.where(dot_rows(attitudes[1:], attitudes[:-1]) >= 0, 1.0, -1.0)])[:, None]
 
 
 def _rounded(design: Design, equipment: Equipment) -> Design:

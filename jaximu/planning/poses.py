@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -95,12 +97,11 @@ def short_order(up: FloatArray) -> IntArray:
     improved = True
     while improved:
         improved = False
-        for first in range(1, len(order) - 1):
-            for last in range(first + 1, len(order)):
-                other = order[:first] + order[first : last + 1][::-1] + order[last + 1 :]
-                if length(other) < length(order) - 1e-9:
-                    order = other
-                    improved = True
+        for first, last in combinations(range(1, len(order)), 2):
+            other = order[:first] + order[first : last + 1][::-1] + order[last + 1 :]
+            if length(other) < length(order) - 1e-9:
+                order = other
+                improved = True
     return np.array(order)
 
 
@@ -112,11 +113,9 @@ def _lifted(azimuth: float, j: str, k: str) -> str:
     """Name the side, corner or edge of a level box that lies in a direction, counted from axis j towards axis k."""
     quarter, rest = divmod(azimuth, np.pi / 2)
     if np.pi / 2 - rest < 1e-9:
-        quarter = quarter + 1
-        rest = 0.0
-    names = [f"+{j}", f"+{k}", f"−{j}", f"−{k}"]
-    side = names[int(quarter) % 4]
-    following = names[int(quarter + 1) % 4]
+        quarter, rest = quarter + 1, 0.0
+    names = f"+{j}", f"+{k}", f"−{j}", f"−{k}"
+    side, following = (names[int(quarter + step) % 4] for step in (0, 1))
     if rest < 1e-9:
         return f"{side} side"
     if abs(rest - np.pi / 4) < 1e-9:
@@ -154,16 +153,11 @@ def attitude_words(attitude: FloatArray) -> str:
     heading = _heading(attitude, up)
     name = f"+{'xyz'[_seen(up)[0]]}"
     turned = round(np.degrees(heading), 6)
-    sides = {
-        0.0: "away from you",
-        90.0: "to your left",
-        -90.0: "to your right",
-        180.0: "towards you",
-        -180.0: "towards you",
-    }
-    side = sides.get(turned)
-    if side is None:
-        ahead = abs(turned) < 90
-        off = abs(turned) if ahead else 180 - abs(turned)
-        side = f"{'away from' if ahead else 'towards'} you, {off:.4g}° to the {'left' if turned > 0 else 'right'}"
+    way, off = ("away from", abs(turned)) if abs(turned) < 90 else ("towards", 180 - abs(turned))
+    hand = "left" if turned > 0 else "right"
+    side = f"{way} you"
+    if off == 90:
+        side = f"to your {hand}"
+    elif off > 0:
+        side += f", {off:.4g}° to the {hand}"
     return f"{pose_words(up)}; {name} points {side}"

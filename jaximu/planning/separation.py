@@ -29,9 +29,7 @@ from jaximu.ground.vectors import submatrix
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.noise import drawn_noise
-from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import observed_poses, segment
 from jaximu.simulation import simulate
 from jaximu.simulation.protocols import Environment, Positions, Protocol, RateTable
@@ -110,8 +108,7 @@ def _rival(diagnosis: Diagnosis, cause: Named, name: str) -> Effect:
     statistic = evidence.scores().statistic
 
     def best(name: str) -> int:
-        indices = [k for k, block in enumerate(evidence.blocks) if block.name == name]
-        return max(indices, key=lambda k: statistic[k])
+        return max([k for k, block in enumerate(evidence.blocks) if block.name == name], key=lambda k: statistic[k])
 
     others = [other.name for other in diagnosis.effects if other.name != cause.name]
     indices = [best(wanted) for wanted in (name, *others) if any(block.name == wanted for block in evidence.blocks)]
@@ -156,22 +153,16 @@ def _experiment(diagnosis: Diagnosis, protocol: Protocol, environment: Environme
     noise = diagnosis.noise
     gravity = diagnosis.calibration.gravity.value
     rate = round(diagnosis.experiment.recordings[0].accelerometer.rate, 3)
-    silent, truth = simulate(imu, protocol, rate=rate, seed=1, environment=environment)
-    recording = _noisy(silent, noise)
-    if protocol.reference:
-        stations, _ = observe_stations(recording, truth.schedule, gravity, noise)
-        return Experiment(RecordedStations(recording, stations), imu)
-    part = segment(recording)
-    return Experiment(RecordedByHand((part,), observed_poses((part,), gravity, noise=noise)), imu)
-
-
-def _noisy(recording: Recording, noise: NoiseModel) -> Recording:
-    changed = {}
+    recording, truth = simulate(imu, protocol, rate=rate, seed=1, environment=environment)
     for number, name in enumerate(("accelerometer", "gyroscope")):
         signal = getattr(recording, name)
         drawn = drawn_noise(getattr(noise, name), len(signal), signal.rate, [1, number]) * signal.nominal_scale
-        changed[name] = replace(signal, values=signal.values + drawn)
-    return replace(recording, **changed)
+        recording = replace(recording, **{name: replace(signal, values=signal.values + drawn)})
+    if protocol.reference:
+        stations, _ = observe_stations(recording, truth.schedule, gravity, noise)
+        return Experiment(RecordedStations(recording, stations), imu)
+    parts = (segment(recording),)
+    return Experiment(RecordedByHand(parts, observed_poses(parts, gravity, noise=noise)), imu)
 
 
 def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict[str, float]:

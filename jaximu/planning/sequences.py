@@ -148,8 +148,7 @@ class Filter:
         initial = self.begun()
         states = self.errors.states
         if not known:
-            free = [index for index in range(len(self.names)) if index not in self.earth]
-            initial.root[states:, states:][free] = 0.0
+            initial.root[states:, states:][[index for index in range(len(self.names)) if index not in self.earth]] = 0.0
         return run(initial, self._headed(rows, start.inv()))[0]
 
     @property
@@ -284,33 +283,36 @@ def propose_sequence(
     estimator, notes = filter_of(known, equipment, positions, effects, noise)
     label = parameter or criterion
     criterion, weights = criterion_of(criterion, parameter, estimator.names)
-    words = _searched(estimator, choices, positions, criterion, weights, report)
+
+    def left(knowledge: Knowledge) -> float:
+        return estimator.value(knowledge, criterion, weights)
+
+    words = _searched(estimator, choices, positions, left, report)
     knowledge = estimator.whole(words)
-    best = estimator.value(knowledge, criterion, weights)
+    best = left(knowledge)
     classical = tuple(NINETEEN.split())
     if positions == len(classical) + 1 and set(classical) <= set(choices):
-        other = estimator.whole(classical)
-        value = estimator.value(other, criterion, weights)
+        value = left(other := estimator.whole(classical))
         ratio = float(np.exp(value - best))
         if ratio <= AS_GOOD:
             words, knowledge, best = classical, other, value
             notes += ("the well-known nineteen positions do as well as any here, and are proposed.",)
         else:
             notes += (f"the well-known nineteen positions, as long, leave {ratio:.3g} times as much.",)
-    return _proposal(estimator, words, knowledge, best, criterion, label, weights, equipment, known.source, notes)
+    unit = float(estimator.size @ weights) or 1.0
+    sigmas = [float(np.exp(logarithm)) * unit for logarithm in (left(estimator.begun()), best, best)]
+    return _proposal(estimator, words, knowledge, sigmas, label, equipment, known.source, notes)
 
 
 def _searched(
     estimator: Filter,
     choices: Sequence[str],
     positions: int,
-    criterion: str,
-    weights: FloatArray,
+    left: Callable[[Knowledge], float],
     report: Callable[[str], None],
 ) -> tuple[str, ...]:
-    """The rotations that make the criterion smallest, of those that are tried."""
-    rested = estimator.rested()
-    kept: list[tuple[float, tuple[str, ...], Rotation, Knowledge]] = [(0.0, (), _UPRIGHT, rested)]
+    """The rotations that make smallest what is left, of those that are tried."""
+    kept: list[tuple[float, tuple[str, ...], Rotation, Knowledge]] = [(0.0, (), _UPRIGHT, estimator.rested())]
     for number in range(1, positions):
         report(f"position {number + 1} of {positions}")
         longer = []
@@ -318,10 +320,11 @@ def _searched(
             for word in choices:
                 after = estimator.rotated(before, attitude, word)
                 reached = attitude * Rotation.from_rotvec(rotation_vector(word))
-                longer.append((estimator.value(after, criterion, weights), (*words, word), reached, after))
-        longer.sort(key=lambda option: option[0])
+                longer.append((left(after), (*words, word), reached, after))
         kept = []
-        for option in longer:  # of sequences that are alike but for the names of axes one is enough
+        for option in sorted(
+            longer, key=lambda option: option[0]
+        ):  # of sequences that are alike but for the names of axes one is enough
             if len(kept) < _WIDTH and (not kept or option[0] - kept[-1][0] > 1e-7):
                 kept.append(option)
     return kept[0][1]
@@ -331,17 +334,14 @@ def _proposal(
     estimator: Filter,
     words: Sequence[str],
     knowledge: Knowledge,
-    value: float,
-    criterion: str,
+    criterion: Sequence[float],
     label: str,
-    weights: FloatArray,
     equipment: Equipment,
     source: str,
     notes: tuple[str, ...],
 ) -> Proposal:
-    start = estimator.begun()
     size = estimator.size
-    before, after = (np.asarray(estimator.numbers(stage)) for stage in (start, knowledge))
+    before, after = (np.asarray(estimator.numbers(stage)) for stage in (estimator.begun(), knowledge))
     states = estimator.errors.states
     earth = list(estimator.earth)
     root = estimator.whole(words, known=False).root[states:, states:]
@@ -360,10 +360,7 @@ def _proposal(
             "the gyroscope's noise hides the Earth's rotation from this sequence: it is known to "
             f"± {left} (95 %), and is part of how uncertain the biases are.",
         )
-    unit = float(size @ weights) or 1.0
-    first = estimator.value(start, criterion, weights)
     poses, turns = _poses_and_turns(words, equipment)
-    at_first, at_last = (float(np.exp(logarithm)) * unit for logarithm in (first, value))
     return Proposal(
         equipment,
         label,
@@ -373,13 +370,11 @@ def _proposal(
         estimator.names,
         (before, after),
         np.zeros(len(size)),
-        at_first,
-        at_last,
-        at_last,
-        rank,
-        weak,
-        source,
-        notes,
+        *criterion,
+        rank=rank,
+        open=weak,
+        source=source,
+        notes=notes,
     )
 
 
@@ -398,6 +393,6 @@ def _poses_and_turns(words: Sequence[str], equipment: Equipment) -> tuple[tuple[
         angle = float(np.linalg.norm(vector))
         attitude *= Rotation.from_rotvec(vector)
         poses.append(stand(attitude))
-        turn_words = f"{np.degrees(angle):.0f}° about {'+' if vector.sum() > 0 else '−'}{word[0]}"
-        turns.append(Turn(vector / angle, angle, angle / equipment.turn, turn_words))
+        about = f"{np.degrees(angle):.0f}° about {'+' if vector.sum() > 0 else '−'}{word[0]}"
+        turns.append(Turn(vector / angle, angle, angle / equipment.turn, about))
     return tuple(poses), tuple(turns)

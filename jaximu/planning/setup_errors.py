@@ -36,7 +36,7 @@ from jaximu.planning.information import root_of
 from jaximu.recordings.entry import ScheduleEntry, times_of
 from jaximu.recordings.observations import Stations
 from jaximu.simulation import Case, Specification
-from jaximu.simulation.protocols import Environment, Motion
+from jaximu.simulation.protocols import Environment, Motion, Plan
 from jaximu.simulation.specification import Draw
 
 _TURN_ONLY = ("rate-table", "single-axis-table")  # their angle about the vertical is all that is set
@@ -270,8 +270,7 @@ class ErrorScheme(eqx.Module):
         delay, turned, coefficients = jnp.split(errors, np.cumsum(self.sizes[:2]))
         first = np.cumsum([0, *(effect.size for effect in self.effects)])
         parts = [coefficients[low:high] for low, high in pairwise(first)]
-        true = self.stimulus(delay[0], turned.reshape(-1, 3))
-        outputs = with_effects(self.unit, self.effects, parts).respond(true)
+        outputs = with_effects(self.unit, self.effects, parts).respond(self.stimulus(delay[0], turned.reshape(-1, 3)))
         return jnp.stack([jnp.sum(self.stations.weight[..., None] * output, axis=-2) for output in outputs])
 
 
@@ -284,18 +283,10 @@ def with_effects(unit: Imu, effects: Sequence[Effect], coefficients: Sequence[Ar
     return unit.with_effects(*unit.all_effects().values(), *made)
 
 
-@dataclass(frozen=True)
-class _Stops:
-    """Where the table is set. up (A, 3): body direction that points up. setting (A,): which setting of the axes that
-    are not vertical. ends (S, 2): stops at which an interval begins and ends.
+def _stops(intervals: tuple[ScheduleEntry, ...], motion: Motion) -> tuple[FloatArray, IntArray, IntArray]:
+    """Where the table is set: body directions (A, 3) that point up, which setting of the axes that are not vertical
+    (A,); and at which stops an interval begins and ends (S, 2).
     """
-
-    up: FloatArray
-    setting: IntArray
-    ends: IntArray
-
-
-def _stops(intervals: tuple[ScheduleEntry, ...], motion: Motion) -> _Stops:
     segment = np.searchsorted(motion.start, [interval.start + 1e-9 for interval in intervals], side="right") - 1
     begin = [Rotation.from_quat(motion.attitude[row], scalar_first=True) for row in segment]
     up = []
@@ -315,23 +306,20 @@ def _stops(intervals: tuple[ScheduleEntry, ...], motion: Motion) -> _Stops:
             last = attitude * Rotation.from_rotvec(interval.angle * interval.vector)
             stop(last, abs(attitude.apply(interval.vector)[2]) < 1 - 1e-9)
         ends.append((first, len(up) - 1))
-    return _Stops(np.array(up), np.array(setting), np.array(ends))
+    return np.array(up), np.array(setting), np.array(ends)
 
 
-def _attitude_roots(stops: _Stops, kind: str) -> dict[str, FloatArray]:
+def _attitude_roots(up: FloatArray, setting: IntArray, kind: str) -> dict[str, FloatArray]:
     """How unit draws of each kind of error turn the unit at the stops: (3 A, k)."""
-    up = stops.up
     count = len(up)
-    settings = int(stops.setting.max()) + 1
-    member = stops.setting[:, None] == np.arange(settings)  # (A, settings)
+    member = setting[:, None] == np.arange(int(setting.max()) + 1)  # (A, settings)
     across = np.eye(3) - up[:, :, None] * up[:, None, :]
     about = np.eye(count)[:, None, :] * up[:, :, None]  # (A, 3, A)
     others = np.einsum("aij,as->aisj", across, member).reshape(count, 3, -1)
     mounted = np.ones((count, 1)) if kind == "dividing-head" else member  # one mounting
     mounting = np.einsum("as,ij->aisj", mounted, np.eye(3)).reshape(count, 3, -1)
     polar = np.arccos(np.clip(up[:, 2], -1, 1))
-    level = np.hypot(up[:, 0], up[:, 1]) < 1e-9
-    azimuth = np.where(level, 0.0, np.arctan2(up[:, 1], up[:, 0]))
+    azimuth = np.where(np.hypot(up[:, 0], up[:, 1]) < 1e-9, 0.0, np.arctan2(up[:, 1], up[:, 0]))
     turned = Rotation.from_euler("z", azimuth[:, None])
     tilting = turned.apply(np.stack([np.cos(polar), np.zeros(count), -np.sin(polar)], axis=1))
     roots = {
@@ -382,16 +370,9 @@ def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...]
     stations, fast, slow, ramps, notes = _with_noise(case, stations, plan.intervals)
 
     effects = _effects_by_source(errors, case.imu, ramps)
-    stops = _stops(plan.intervals, plan.motion)
-    scheme = _scheme(
-        case.imu,
-        plan.motion,
-        tuple(effect for group in effects.values() for effect, _ in group),
-        stations,
-        plan.intervals,
-        stops,
-        errors,
-    )
+    up, setting, ends = _stops(plan.intervals, plan.motion)
+    kinds = tuple(effect for group in effects.values() for effect, _ in group)
+    scheme = _scheme(case.imu, plan, kinds, stations, ends, len(up), _stated(errors, "vibration").get("rms", 0.0))
     delay, turned, coefficient, added = np.cumsum([0, *scheme.sizes])[:4]  # where each kind of error begins
     roots = {}
 
@@ -401,7 +382,7 @@ def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...]
         root = np.concatenate([roots[name], root], axis=1) if name in roots else root
         roots[name] = root[:, np.any(root != 0, axis=0)]
 
-    for name, root in _attitude_roots(stops, protocol.kind).items():
+    for name, root in _attitude_roots(up, setting, protocol.kind).items():
         if name in errors:
             add(name, errors[name][0] * root, turned)
     if "timing" in errors:
@@ -458,32 +439,24 @@ def _with_noise(case: Case, stations: Stations, intervals: Sequence[ScheduleEntr
         for whole, part in zip((fast, slow), parts, strict=True):
             whole[3 * number : 3 * number + 3, :count, :count] = np.where(there[:, None] & there, part * scale**2, 0.0)
     total = fast + slow
-    unused = np.concatenate([np.tile(~np.asarray(mask), (3, 1)) for mask in used.values()])
-    total += unused[:, :, None] * np.eye(size)
+    total += np.concatenate([np.tile(~np.asarray(mask), (3, 1)) for mask in used.values()])[:, :, None] * np.eye(size)
     stations = replace(stations, accelerometer_covariance=total[:3], gyroscope_covariance=total[3:])
     return stations, fast, slow, ramps, tuple(notes)
 
 
 def _effects_by_source(errors: StatedErrors, unit: Imu, ramps: Mapping[str, FloatArray]):
     """By source: effects that make its errors, each with the sizes of its coefficients."""
-    gains = {name: triad.scales for name, triad in unit.triads().items()}
 
     def effect(name: str, sizes) -> tuple[Effect, FloatArray]:
         made = CATALOGUE[name].dormant()
         scale = np.ones(made.size)
         if made.unit.startswith("output"):  # stated for an SI output
-            axes = gains[made.owner]
+            axes = unit.triads()[made.owner].scales
             scale = np.repeat(axes, made.size // 3) if made.size % 3 == 0 else np.full(made.size, axes.mean())
         return made, scale * np.broadcast_to(sizes, (made.size,))
 
-    sources = {}
-    for source, name in (
-        ("tilt", "setup.table_tilt"),
-        ("gravity", "setup.gravity"),
-        ("rate", "setup.table_rate_scale"),
-    ):
-        if source in errors:
-            sources[source] = [effect(name, errors[source][0])]
+    setup = {"tilt": "setup.table_tilt", "gravity": "setup.gravity", "rate": "setup.table_rate_scale"}
+    sources = {source: [effect(name, errors[source][0])] for source, name in setup.items() if source in errors}
     if "earth_rotation" in errors:
         latitude = np.radians(errors["earth_rotation"][0])
         level = np.cos(latitude) / np.sqrt(2)
@@ -494,8 +467,8 @@ def _effects_by_source(errors: StatedErrors, unit: Imu, ramps: Mapping[str, Floa
     drifts = {name: np.hypot(drifts.get(name, 0.0), ramp) for name, ramp in ramps.items()}
     for source, stem, sizes in (("drift", "bias_ramp", drifts), ("temperature", "temperature", temperature)):
         sources[source] = [effect(f"{PREFIXES[name]}.{stem}", sizes.get(name, 0.0)) for name in INERTIAL_QUANTITIES]
-    vibration = _stated(errors, "vibration")
-    sources["vibration"] = [effect("gyro.vibration_rectification", vibration.get("rectification", 0.0))]
+    rectified = _stated(errors, "vibration").get("rectification", 0.0)
+    sources["vibration"] = [effect("gyro.vibration_rectification", rectified)]
     sources |= {name: [effect(name, size)] for name, (size, _) in errors.items() if name in CATALOGUE}
     return {
         source: kept for source, pairs in sources.items() if (kept := [(e, size) for e, size in pairs if size.any()])
@@ -503,21 +476,15 @@ def _effects_by_source(errors: StatedErrors, unit: Imu, ramps: Mapping[str, Floa
 
 
 def _scheme(
-    unit: Imu,
-    motion: Motion,
-    effects: tuple[Effect, ...],
-    stations: Stations,
-    intervals: Sequence[ScheduleEntry],
-    stops: _Stops,
-    errors: StatedErrors,
+    unit: Imu, plan: Plan, effects: tuple[Effect, ...], stations: Stations, ends: IntArray, stops: int, rms: float
 ) -> ErrorScheme:
-    count = len(intervals)
+    """Return the scheme of a plan. **Arguments:** `rms`: of the vibration, m/s²."""
+    count = len(ends)
     size = stations.turn.shape[0]
-    ends, axis, angle = np.zeros((size, 2), np.int64), np.zeros((size, 3)), np.full(size, np.inf)
-    ends[:count], axis[:count] = stops.ends, [interval.vector for interval in intervals]
-    angle[:count] = [interval.angle if interval.kind == "turn" else np.inf for interval in intervals]
+    whole, axis, angle = np.zeros((size, 2), np.int64), np.zeros((size, 3)), np.full(size, np.inf)
+    whole[:count], axis[:count] = ends, [interval.vector for interval in plan.intervals]
+    angle[:count] = [interval.angle if interval.kind == "turn" else np.inf for interval in plan.intervals]
     pace = np.einsum("sqi,si->sq", np.asarray(stations.stimulus.angular_rate), axis) / angle[:, None]
     done = (pace.cumsum(axis=1) - pace / 2) * (_durations(stations) / pace.shape[1])[:, None]
-    rms = _stated(errors, "vibration").get("rms", 0.0)
     power = np.where(np.asarray(stations.turn)[:, None], rms**2, np.zeros_like(pace))
-    return ErrorScheme(unit, effects, stations, motion, ends, done, pace, power, len(stops.up))
+    return ErrorScheme(unit, effects, stations, plan.motion, whole, done, pace, power, stops)
