@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
 from jaximu.cli.options import option, switch, takes_options
@@ -20,7 +21,6 @@ from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.acceptance import Acceptance, Limits, Line
-    from jaximu.calibration import Calibration
 
 
 _STATUS = {"pass": 0, "fail": 3, "undecided": 4}
@@ -66,7 +66,10 @@ class AcceptCommand:
     def run(self) -> None:
         """Do what the command line says."""
         if self.explain:
-            _explain()
+            from jaximu.acceptance import limits
+            from jaximu.recordings import trace
+
+            print(inspect.getdoc(limits), inspect.getdoc(trace), sep="\n\n")
             return
         if not self.calibrations:
             raise InputError(
@@ -94,7 +97,6 @@ class AcceptCommand:
         if self.golden:
             raise InputError("--golden names a device of a fleet's table; these are calibrations.")
         limits = limits_of(self.limits, self.rule, self.risk)
-        from jaximu.acceptance import accept
         from jaximu.acceptance.decision import worst
         from jaximu.noise.analysis import read_analysis
 
@@ -106,7 +108,7 @@ class AcceptCommand:
         with progress("deciding"):
             for calibration, path in zip(loaded, self.calibrations, strict=True):
                 wider, hidden = options.allowing_for(calibration, self.diagnosis)
-                acceptance = accept(wider, limits, known, path)
+                acceptance = jaximu.accept(wider, limits, known, path)
                 acceptances.append(replace(acceptance, notes=(*acceptance.notes, *hidden)))
         certificate = not self.without_certificate
         if self.results.output is not None and certificate:
@@ -157,15 +159,6 @@ class AcceptCommand:
             say(f"Written: {self.measurements}")
 
 
-def _explain() -> None:
-    from jaximu.acceptance import limits
-    from jaximu.recordings import trace
-
-    print(inspect.getdoc(limits))
-    print()
-    print(inspect.getdoc(trace))
-
-
 def limits_of(path: Path, rule: str | None, risk: float | None) -> Limits:
     """Read limits from a file of limits or from a fleet's table."""
     if path.suffix.lower() == ".parquet":
@@ -181,13 +174,12 @@ def limits_of(path: Path, rule: str | None, risk: float | None) -> Limits:
 # --- single units -----------------------------------------------------------------------------------------------------
 
 
-def _loaded(path: Path, trace: Path | None) -> Calibration:
+def _loaded(path: Path, trace: Path | None) -> jaximu.Calibration:
     """Load a calibration that nobody has changed, with what a file says of it beside its own trace."""
     from jaximu.acceptance.verify import CHANGED, state_of
-    from jaximu.calibration import load_calibration
     from jaximu.recordings.trace import read_trace
 
-    calibration = load_calibration(path)
+    calibration = jaximu.load_calibration(path)
     if state_of(path) == CHANGED:
         raise InputError(
             f"{path} was changed after it was written: its content does not have the hash that it states. Take the "
@@ -198,7 +190,7 @@ def _loaded(path: Path, trace: Path | None) -> Calibration:
     return calibration
 
 
-def _refuse_doubled(calibrations: Sequence[Calibration], paths: Sequence[Path]) -> None:
+def _refuse_doubled(calibrations: Sequence[jaximu.Calibration], paths: Sequence[Path]) -> None:
     earlier: dict[str, Path] = {}
     for calibration, path in zip(calibrations, paths, strict=True):
         serial = (calibration.trace or {}).get("serial", "")
@@ -248,7 +240,7 @@ def _stems(acceptances: Sequence[Acceptance]) -> dict[str, Acceptance]:
     }
 
 
-def _write(acceptances: Sequence[Acceptance], loaded: Sequence[Calibration], output: Path) -> tuple[Path, ...]:
+def _write(acceptances: Sequence[Acceptance], loaded: Sequence[jaximu.Calibration], output: Path) -> tuple[Path, ...]:
     """Write the certificates of units of which nothing is missing; none where no calibrations are given."""
     from jaximu.ground.atomic import write_files
     from jaximu.recordings.trace import missing

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.cli.options import takes_options
@@ -36,9 +37,7 @@ class AllanCommand:
         with progress("reading"):
             recordings = [stated.read(path, STANDARD, alone=True) for path, stated in self.log.spread(self.logs)]
         with progress("identifying the noise"):
-            from jaximu.noise.analysis import analyse_noise
-
-            analysis = analyse_noise(recordings)
+            analysis = jaximu.allan(recordings)
             from jaximu.report.allan import kalibr_text, page_of
 
             text = json.dumps(document(analysis), indent=1, allow_nan=False)

@@ -128,18 +128,11 @@ def _common(arguments: Sequence[str]) -> list[str]:
     """Take out what every verb takes, and do as it says."""
     from jaximu.cli import messages
 
-    messages.level = 1
-    rest = []
-    for text in arguments:
-        if text in ("--quiet", "-q"):
-            messages.level = 0
-        elif text in ("--verbose", "-v"):
-            messages.level = 2
-        elif text == "--no-color":
-            os.environ["NO_COLOR"] = "1"
-        else:
-            rest.append(text)
-    return rest
+    levels = {"--quiet": 0, "-q": 0, "--verbose": 2, "-v": 2}
+    messages.level = [1, *(levels[text] for text in arguments if text in levels)][-1]
+    if "--no-color" in arguments:
+        os.environ["NO_COLOR"] = "1"
+    return [text for text in arguments if text not in (*levels, "--no-color")]
 
 
 def _run(arguments: Sequence[str]) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.cli.options import takes_options
@@ -31,10 +32,9 @@ class ArrayCommand(options.Fits):
         gravity = self.local.value()
         self.results.prepare()
         recordings, known = self.log.read_unit(self.logs, gravity, self.noise, several=True)
-        from jaximu.calibration import calibrate_array
 
         with progress("calibrating"):
-            array = calibrate_array(recordings, gravity, static=known, loss=self.loss, repair=self.repair)
+            array = jaximu.array(recordings, gravity, static=known, loss=self.loss, repair=self.repair)
         units = {f"calibration_{number}": unit.calibration for number, unit in enumerate(array.units, 1)}
         self.results.present(
             array.summary, "array.json, report.html and the calibrations", {}, array.text, array=array, **units

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.cli.options import switch, takes_options
 from jaximu.ground.errors import InputError
-
-if TYPE_CHECKING:
-    from jaximu.calibration import Calibration
-    from jaximu.ground.gravity import LocalGravity
 
 
 @takes_options
@@ -57,9 +54,7 @@ class CalibrateCommand(options.Fits):
         else:
             recordings, known = self.log.read_unit(self.logs, gravity, self.noise)
             with progress("calibrating"):
-                from jaximu.calibration import calibrate
-
-                calibration = calibrate(
+                calibration = jaximu.calibrate(
                     recordings,
                     gravity,
                     static=known,
@@ -72,7 +67,7 @@ class CalibrateCommand(options.Fits):
         calibration = replace(calibration, trace=trace)
         self.results.present(calibration.summary, calibration=calibration)
 
-    def _of_means(self, gravity: LocalGravity, unusable: list[str]) -> Calibration:
+    def _of_means(self, gravity: jaximu.LocalGravity, unusable: list[str]) -> jaximu.Calibration:
         """Calibrate from a table of pose means."""
         if len(self.logs) != 1:
             raise InputError(f"--means takes one table, found {len(self.logs)} files.")

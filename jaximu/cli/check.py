@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.cli.options import switch, takes_options
@@ -33,13 +34,11 @@ class CheckCommand(options.Fits):
         gravity = self.local.value()
         options.require_files(self.calibration)
         self.results.prepare()
-        from jaximu.calibration import load_calibration
-        from jaximu.diagnosis import check
 
-        old = load_calibration(self.calibration).inertial()
+        old = jaximu.load_calibration(self.calibration).inertial()
         recordings, known = self.log.alike(old).read_unit(self.logs, gravity, self.noise)
         with progress("checking"):
-            validity = check(old, recordings, gravity, static=known, segmentation=self.poses.value())
+            validity = jaximu.check(old, recordings, gravity, static=known, segmentation=self.poses.value())
         self.results.present(validity.summary, "check.json and report.html", check=validity)
         if self.fail_on == "invalid" and validity.verdict not in ("valid", "session"):
             raise SystemExit(1)

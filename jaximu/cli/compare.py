@@ -8,6 +8,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.cli.options import option, switch, takes_options
@@ -47,15 +48,13 @@ class CompareCommand:
             raise InputError("name two calibrations of the unit or more: jaximu compare OLD.json NEW.json.")
         options.require_files(*self.calibrations, self.limits)
         self.results.prepare()
-        from jaximu.acceptance.history import compare
-        from jaximu.calibration import load_calibration
         from jaximu.cli.accept import limits_of
         from jaximu.model.data_sheet import SI_UNITS, parse_quantity
 
         fastest = parse_quantity(self.rate, SI_UNITS["angular_rate"]["B"], "--rate")
         with progress("comparing"):
-            history = compare(
-                *map(load_calibration, self.calibrations),
+            history = jaximu.compare(
+                *map(jaximu.load_calibration, self.calibrations),
                 dates=None if self.dates is None else [text.strip() for text in self.dates.split(",")],
                 limits=None if self.limits is None else limits_of(self.limits, None, None),
                 rate=fastest,

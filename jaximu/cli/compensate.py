@@ -5,6 +5,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
 from jaximu.cli.options import option, takes_options
@@ -35,21 +36,19 @@ class CompensateCommand:
         """Do what the command line says."""
         options.require_files(self.calibration, self.recording)
         options.require_apart(self.output, self.calibration, self.recording, self.log.gyro_log)
-        from jaximu.calibration import compensate, load_calibration
         from jaximu.ground.quantities import sentence
         from jaximu.mistakes import prepare
-        from jaximu.recordings import write_recording
         from jaximu.report.export import is_messages, write_messages
 
-        model = load_calibration(self.calibration)
+        model = jaximu.load_calibration(self.calibration)
         with progress("compensating"):
             raw = self.log.alike(model).read(self.recording, model.gravity, alone="accelerometer" not in model.triads())
-            written = compensate(model, raw)
+            written = jaximu.compensate(model, raw)
             noticed = prepare(raw).notes
             if is_messages(self.output):
                 write_messages(model, raw, written, self.output)
             else:
-                write_recording(written, self.output)
+                jaximu.write_recording(written, self.output)
         for note in (*noticed, *(note for note in written.notes if note.startswith(("extrapolated", "Against")))):
             say(f"note: {sentence(note)}")
         if noticed:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.cli.options import option, takes_options
@@ -16,7 +17,6 @@ from jaximu.ground.reexport import later
 from jaximu.ground.units import SENSOR_UNITS
 
 if TYPE_CHECKING:
-    from jaximu.calibration import Calibration
     from jaximu.navigation.estimator_noise import EstimatorNoise, MeasuredErrors
     from jaximu.navigation.trajectory import Place, Trajectory
     from jaximu.noise.stated import SensorNoise
@@ -66,12 +66,10 @@ class ConsequencesCommand(options.Reads):
         """Do what the command line says."""
         targets = self._targets()
         self.results.prepare()
-        from jaximu.calibration import load_calibration
-        from jaximu.navigation.consequences import consequences
         from jaximu.navigation.trajectory import Place
 
-        model, hidden = options.allowing_for(load_calibration(self.calibration), self.diagnosis)
-        other = None if self.against is None else load_calibration(self.against)
+        model, hidden = options.allowing_for(jaximu.load_calibration(self.calibration), self.diagnosis)
+        other = None if self.against is None else jaximu.load_calibration(self.against)
         noise = None if self.noise_file is None else options.stated_noise(self.noise_file)
         _require_densities(targets, noise or {})
         gravity = model.gravity if self.local == options.LOCAL else self.local.value()
@@ -81,7 +79,7 @@ class ConsequencesCommand(options.Reads):
         trajectory, stated = self._trajectory(model, site, measured)
         trajectory.require_range(stated | limits)
         with progress("propagating errors"):
-            result = consequences(
+            result = jaximu.consequences(
                 model,
                 trajectory,
                 noise,
@@ -166,7 +164,7 @@ class ConsequencesCommand(options.Reads):
                     raise InputError(f"{name}: {text!r} is no range.")
         return limits
 
-    def _measured(self, model: Calibration, site: Place) -> MeasuredErrors | None:
+    def _measured(self, model: jaximu.Calibration, site: Place) -> MeasuredErrors | None:
         """Return the errors of the calibrated unit along a log against what a reference measured; None without one."""
         if self.reference is None or self.path is None:
             return None
@@ -182,11 +180,10 @@ class ConsequencesCommand(options.Reads):
             )
 
     def _trajectory(
-        self, model: Calibration, site: Place, measured: MeasuredErrors | None
+        self, model: jaximu.Calibration, site: Place, measured: MeasuredErrors | None
     ) -> tuple[Trajectory, dict[str, float]]:
         """Return the path, and the ranges that it states."""
         from jaximu.navigation.trajectory import level_driving, of_recording, of_specification
-        from jaximu.recordings.recording import Signal
 
         if self.path is None:
             reference = model.inertial().imu.accelerometer.temperature_reference
@@ -203,7 +200,7 @@ class ConsequencesCommand(options.Reads):
             except InputError as error:
                 raise InputError(f"{self.path} is no specification, and as a log: {error}") from error
             if measured is not None and recording.attitude is None:
-                recording = replace(recording, attitude=Signal(measured.stamp, measured.rotation, ""))
+                recording = replace(recording, attitude=jaximu.Signal(measured.stamp, measured.rotation, ""))
             return of_recording(recording, model, site, self.duration or 60.0), {}
 
 

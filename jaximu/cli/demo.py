@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.diagnose import give_diagnosis
 from jaximu.cli.messages import progress
 from jaximu.cli.options import option, takes_options
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
-
-if TYPE_CHECKING:
-    from jaximu.model.effects import Effect
-    from jaximu.model.sensor import Imu
-
 
 _HIDDEN = {
     "accel.quadratic": 3e-4,
@@ -63,13 +58,10 @@ class DemoCommand:
             imu = draw_imu(self.seed).with_effects(flaw)
             _simulate(imu, self.seed, self.output)
         with progress("diagnosing"):
-            from jaximu.diagnosis import diagnose
-            from jaximu.recordings.readers import read_recording
-
             recording, heldout, rest = (
-                read_recording(self.output / f"{n}.parquet") for n in ("recording", "heldout", "rest")
+                jaximu.read_recording(self.output / f"{n}.parquet") for n in ("recording", "heldout", "rest")
             )
-            diagnosis = diagnose(recording, LocalGravity(9.80665, 0.0), static=rest, heldout=heldout)
+            diagnosis = jaximu.diagnose(recording, LocalGravity(9.80665, 0.0), static=rest, heldout=heldout)
         give_diagnosis(diagnosis, results)
         _print_truth(imu, flaw)
 
@@ -86,9 +78,8 @@ def _write_phone(folder: Path) -> None:
     print(f"Written to {folder}: a simulated phone's recording. Next: jaximu info {accelerometer}")
 
 
-def _simulate(imu: Imu, seed: int, output: Path) -> None:
+def _simulate(imu: jaximu.Imu, seed: int, output: Path) -> None:
     """Write three recordings of a unit: two of poses while it warms up, one at rest without its flaw."""
-    from jaximu.recordings import write_recording
     from jaximu.simulation import consumer_noise, simulate
     from jaximu.simulation.protocols import Environment, HandHeld, Static
 
@@ -96,13 +87,13 @@ def _simulate(imu: Imu, seed: int, output: Path) -> None:
         # up and down: on a straight line temperature and time would be one cause
         warming = Environment(temperature=[[0, 22 - 4 * number], [120, 34 + 4 * number], [220, 27]])
         simulated, truth = simulate(imu, HandHeld(), consumer_noise(), seed=seed, power_on=number, environment=warming)
-        write_recording(simulated, output / f"{name}.parquet")
+        jaximu.write_recording(simulated, output / f"{name}.parquet")
         truth.save(output / f"{name}.parquet.truth.json")
     resting, _ = simulate(imu.with_effects(), Static(1200.0), consumer_noise(), seed=seed, power_on=2)
-    write_recording(resting, output / "rest.parquet")
+    jaximu.write_recording(resting, output / "rest.parquet")
 
 
-def _print_truth(imu: Imu, flaw: Effect) -> None:
+def _print_truth(imu: jaximu.Imu, flaw: jaximu.Effect) -> None:
     import numpy as np
 
     from jaximu.ground.quantities import number, readable
@@ -118,12 +109,12 @@ def _print_truth(imu: Imu, flaw: Effect) -> None:
     )
 
 
-def _draw_flaw(seed: int, name: str | None) -> Effect:
+def _draw_flaw(seed: int, name: str | None) -> jaximu.Effect:
     import numpy as np
-
-    from jaximu.model.effects import CATALOGUE
 
     generator = np.random.default_rng([seed, 3])
     chosen = str(generator.choice(sorted(_HIDDEN))) if name is None else name
-    size = CATALOGUE[chosen].size
-    return CATALOGUE[chosen].make(_HIDDEN[chosen] * generator.choice([-1, 1], size) * generator.uniform(0.3, 1, size))
+    size = jaximu.CATALOGUE[chosen].size
+    return jaximu.CATALOGUE[chosen].make(
+        _HIDDEN[chosen] * generator.choice([-1, 1], size) * generator.uniform(0.3, 1, size)
+    )

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.cli.options import option, switch, takes_options
@@ -13,7 +14,6 @@ from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.diagnosis import Diagnosis
-    from jaximu.ground.gravity import LocalGravity
 
 
 @takes_options
@@ -120,7 +120,7 @@ class DiagnoseCommand(options.Fits):
             raise InputError("--heldout-reference goes with --reference.")
         return measured
 
-    def _attribute(self, pattern: str, gravity: LocalGravity) -> None:
+    def _attribute(self, pattern: str, gravity: jaximu.LocalGravity) -> None:
         """Tell what belongs to a unit, to a session or to all."""
         from jaximu.diagnosis import attribute, places_of
 
@@ -136,9 +136,7 @@ class DiagnoseCommand(options.Fits):
                 segmentation=self.poses.value(),
                 repair=self.repair,
             )
-        self.results.present(
-            attribution.summary, "diagnosis.json and report.html", {}, attribution.text, diagnosis=attribution
-        )
+        self.results.present(attribution.summary, "diagnosis.json and report.html", diagnosis=attribution)
         self._end(attribution.verdict)
 
     def _end(self, verdict: str) -> None:
@@ -150,11 +148,5 @@ class DiagnoseCommand(options.Fits):
 def give_diagnosis(diagnosis: Diagnosis, results: options.Results) -> None:
     """Print a diagnosis; write it, the extended calibration and the report where asked."""
     documents = {"calibration": diagnosis.extended_calibration()} if results.keeps else {}
-    results.present(
-        diagnosis.summary,
-        "diagnosis.json, calibration.json and report.html",
-        {},
-        diagnosis.text,
-        diagnosis=diagnosis,
-        **documents,
-    )
+    names = "diagnosis.json, calibration.json and report.html"
+    results.present(diagnosis.summary, names, {}, diagnosis.text, diagnosis=diagnosis, **documents)

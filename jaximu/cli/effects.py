@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import difflib
 import inspect
-from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.options import option, takes_options
 from jaximu.ground.document import Json, entries
@@ -15,10 +15,6 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.page import Page, Section, Table
 from jaximu.ground.quantities import joined, plain, unit_text
 from jaximu.ground.reexport import later
-
-if TYPE_CHECKING:
-    from jaximu.model.effects import Effect
-
 
 _SCOPES = {
     "device": "device: belongs to the unit and holds in other recordings",
@@ -45,19 +41,19 @@ class EffectsCommand:
         """Do what the command line says."""
         from jaximu.model.effects import CATALOGUE
 
-        if self.name is not None and self.name not in CATALOGUE:
-            near = difflib.get_close_matches(self.name, CATALOGUE, n=3, cutoff=0.4)
-            hint = f"near it are {', '.join(near)}" if near else "`jaximu effects` lists them"
-            raise InputError(f"there is no effect {self.name!r} in the catalogue; {hint}.")
-        kinds = list(CATALOGUE.values()) if self.name is None else [CATALOGUE[self.name]]
-        if self.as_json:
-            entries = [_entry(kind) for kind in kinds]
-            options.print_json(entries if self.name is None else entries[0])
+        name, show = self.name, options.print_json if self.as_json else later("report.terminal", "show")
+        if name is None:
+            kinds = [*CATALOGUE.values()]
+            show([_entry(kind) for kind in kinds] if self.as_json else _catalogue(kinds))
+        elif name in CATALOGUE:
+            show((_entry if self.as_json else _page)(CATALOGUE[name]))
         else:
-            later("report.terminal", "show")(_catalogue(kinds) if self.name is None else _page(kinds[0]))
+            near = difflib.get_close_matches(name, CATALOGUE, n=3, cutoff=0.4)
+            hint = f"near it are {', '.join(near)}" if near else "`jaximu effects` lists them"
+            raise InputError(f"there is no effect {name!r} in the catalogue; {hint}.")
 
 
-def _entry(kind: type[Effect]) -> Json:
+def _entry(kind: type[jaximu.Effect]) -> Json:
     plain = "name", "formula", "unit", "scope", "needs", "excited_by", "look_alikes", "typical", "recovery", "source"
     return entries(kind, *plain) | {
         "description": inspect.getdoc(kind),
@@ -67,25 +63,18 @@ def _entry(kind: type[Effect]) -> Json:
     }
 
 
-def _catalogue(kinds: list[type[Effect]]) -> Page:
+def _catalogue(kinds: list[type[jaximu.Effect]]) -> Page:
     """Return the page of all effects."""
     parts = []
     for kind in kinds:
         inner = "".join(f" + {name.replace('_', ' ')}" for name in kind.inner)
         alike = f"; easily taken for {', '.join(kind.look_alikes)}" if kind.look_alikes else ""
-        parts.append(
-            Section(
-                kind.title,
-                (
-                    kind.formula,
-                    f"{kind.size}{inner}, {unit_text(kind.unit)}; {kind.scope}; excited by {kind.excited_by}{alike}",
-                ),
-            )
-        )
+        text = f"{kind.size}{inner}, {unit_text(kind.unit)}; {kind.scope}; excited by {kind.excited_by}{alike}"
+        parts.append(Section(kind.title, (kind.formula, text)))
     return Page(f"{len(kinds)} effects", ("`jaximu effects NAME` shows one in full.",), first=parts)
 
 
-def _page(kind: type[Effect]) -> Page:
+def _page(kind: type[jaximu.Effect]) -> Page:
     """Return the page of one effect."""
     rows = [
         (

@@ -7,6 +7,7 @@ from dataclasses import MISSING
 from pathlib import Path
 from typing import Literal
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.messages import say
 from jaximu.cli.options import option, takes_options
@@ -52,31 +53,31 @@ class ExportCommand:
         if (self.instance or 0) < 0:
             raise InputError(f"--instance: sensors count from 0, found {self.instance}.")
         rate, temperatures = _rate(self.rate_range), _temperatures(self.temperature_range)
-        from jaximu.calibration import load_calibration
         from jaximu.recordings.readers.kalibr import read_noise
         from jaximu.recordings.readers.parameters import read_parameters
         from jaximu.report.export import Composition, ExportedUnit, Range, export, losses
 
-        model = load_calibration(self.calibration)
+        model = jaximu.load_calibration(self.calibration)
         noise = None if self.noise is None else read_noise(self.noise)
-        if self.noise is not None and not getattr(writer(self.to), "NOISE", False):
-            also = "; `jaximu consequences --noise-for` writes the filter's parameters" if self.to in TARGETS else ""
-            say(f"{self.noise} is not used: the {self.to} file holds a calibration and no noise{also}.")
-        if self.in_force is not None or not getattr(writer(self.to), "MAGNETIC", False):
+        to, tool = self.to, writer(self.to)
+        if self.noise is not None and not getattr(tool, "NOISE", False):
+            also = "; `jaximu consequences --noise-for` writes the filter's parameters" if to in TARGETS else ""
+            say(f"{self.noise} is not used: the {to} file holds a calibration and no noise{also}.")
+        if self.in_force is not None or not getattr(tool, "MAGNETIC", False):
             model = model.inertial()
         extent = Range.of(model, rate, temperatures)
         parameters = ExportedUnit.of(model, self.axes, noise, self.instance, self.device)
         composition = None
         if self.in_force is not None:
-            composition = Composition.of(parameters, self.to, read_parameters(self.in_force), self.log_was)
+            composition = Composition.of(parameters, to, read_parameters(self.in_force), self.log_was)
             parameters = composition.unit
-        elif model.reading is not None and model.reading.corrected and hasattr(writer(self.to), "FIRMWARE"):
+        elif model.reading is not None and model.reading.corrected and hasattr(tool, "FIRMWARE"):
             say(
                 "The calibrated log was corrected by the autopilot's parameters: give those in force (--in-force FILE)."
             )
-        path = self.output or self.calibration.with_name(f"{self.calibration.stem}_{self.to}{writer(self.to).SUFFIX}")
+        path = self.output or self.calibration.with_name(f"{self.calibration.stem}_{to}{tool.SUFFIX}")
         options.require_apart(path, self.in_force)
-        written, paths = export(parameters, self.to, path)
+        written, paths = export(parameters, to, path)
         lost = losses(parameters, written, extent)
         axes_words = (written.parameters or parameters).axes
         left = [
@@ -87,7 +88,7 @@ class ExportCommand:
         ]
         if self.as_json:
             document = {
-                "format": self.to,
+                "format": to,
                 "files": [str(path) for path in paths],
                 "axes": axes_words,
                 "convention": written.convention,
@@ -102,7 +103,7 @@ class ExportCommand:
         if composition is not None:
             parts.append(composition.section())
         parts.append(Section(f"Not in the file, and what that costs over {extent.text()}:", (Items(costs),)))
-        later("report.terminal", "show")(Page(f"Calibration for {self.to}", (axes_words,), first=parts))
+        later("report.terminal", "show")(Page(f"Calibration for {to}", (axes_words,), first=parts))
         say(f"Written: {', '.join(map(str, paths))}")
 
 

@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, fields
+from dataclasses import MISSING
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -138,9 +138,8 @@ class FleetCommand:
         """Return what holds for every unit."""
         from jaximu.fleets import Settings
 
-        stated = {option.name: getattr(self.log, option.name) for option in fields(self.log)}
         return Settings(
-            options=tuple(sorted((name, str(value)) for name, value in stated.items() if value is not None)),
+            options=tuple(sorted((name, str(value)) for name, value in vars(self.log).items() if value is not None)),
             gravity=self.local.value(),
             diagnose=self.diagnose,
             segmentation=self.poses.value(),

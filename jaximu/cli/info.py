@@ -322,7 +322,7 @@ def _noise_uses(length: float, rest: float, longest: float, begin: float) -> Ite
     """Yield what a log of `length` seconds, `rest` of them at rest, `longest` at a stretch, shows of the noise."""
     moved = length - rest
     if rest >= 60.0 and moved <= 2.0 + _BUMPS * length:
-        apart = f" but for {moved:.0f} s" if moved > 2.0 else ""
+        apart = f" but for {moved:.0f} s" * (moved > 2.0)
         why = f"at rest for {length:.0f} s{apart}: noise up to some {length / 10:.0f} s of averaging"
         yield Use("allan", why, " -o noise")
     elif longest >= _CUT:

@@ -74,16 +74,7 @@ class LogCommand(options.Fits):
             outcomes, refused = _run_all(_commands(contents, references, self.local, self.noise))
         if not outcomes:
             raise NotPossibleError(f"{_names(self.logs)}: {' '.join(_reasons(contents, refused))} {_RECORD}")
-        report = _Report(
-            self.logs,
-            contents,
-            outcomes,
-            refused,
-            asker.assumed,
-            "".join(map(options.typed, (self.log, self.local, self.noise))),
-            self.results,
-        )
-        report.give()
+        _Report(self, contents, outcomes, refused, asker.assumed).give()
 
 
 # --- what is in the logs
@@ -358,8 +349,8 @@ def _reasons(contents: Sequence[_Content], refused: Mapping[str, str]) -> list[s
     if refused:
         return [sentence(f"{verb}: {text}") for verb, text in refused.items()]
     documents = [content.document for content in contents]
-    poses = [text for document in documents for text in document["findings"] if " pose" in text]
-    poses = [text for document in documents for text in document.get("refused", ())] or poses
+    poses = [text for document in documents for text in document.get("refused", ())]
+    poses = poses or [text for document in documents for text in document["findings"] if " pose" in text]
     return ["Nothing can be determined from it as it is.", *(f"{sentence(text).rstrip('.')}." for text in poses)]
 
 
@@ -374,13 +365,11 @@ def _names(paths: Sequence[Path]) -> str:
 class _Report:
     """All results in one page, one document, and one folder."""
 
-    logs: tuple[Path, ...]
+    command: LogCommand
     contents: Sequence[_Content]
     outcomes: Mapping[str, _Outcome]
     refused: Mapping[str, str]
     assumed: Sequence[str]
-    stated: str
-    results: options.Results
 
     @property
     def lead(self) -> str:
@@ -396,7 +385,7 @@ class _Report:
             for name, document in outcome.documents.items():
                 documents[name if name not in documents else f"{verb}_{name}"] = document
         after = self._next({*documents, *(name.removesuffix(".json") for name in files)})
-        self.results.give(
+        self.command.results.give(
             lambda: later("report.terminal", "show")(self._page(after, whole=False)),
             lambda folder: later("report.html", "write_report")(self._page(after, whole=True), folder),
             "the report and the documents of each verb",
@@ -407,7 +396,7 @@ class _Report:
 
     def _page(self, after: str, whole: bool) -> Page:
         return later("report.log", "page_of")(
-            ", ".join(path.name or str(path) for path in self.logs),
+            ", ".join(path.name or str(path) for path in self.command.logs),
             {verb: outcome.page() for verb, outcome in self.outcomes.items()},
             self.lead,
             [content.document for content in self.contents],
@@ -433,10 +422,12 @@ class _Report:
 
     def _next(self, names: set[str]) -> str:
         """Return the next command, with the names of files that there are."""
-        folder = self.results.output
+        command = self.command
+        folder = command.results.output
         if folder is None:
-            return f"jaximu {shlex.join(map(str, self.logs))}{self.stated} -o results"
-        proposed = _COMMAND.search(self.results.filled(self.outcomes[self.lead].page().next, names))
+            stated = "".join(map(options.typed, (command.log, command.local, command.noise)))
+            return f"jaximu {shlex.join(map(str, command.logs))}{stated} -o results"
+        proposed = _COMMAND.search(command.results.filled(self.outcomes[self.lead].page().next, names))
         if proposed and not _UNFILLED.search(proposed[1]):
             return proposed[1]
         if "calibration" in names:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import UseAppendAction
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.cli.options import option, takes_options
@@ -18,7 +19,6 @@ from jaximu.ground.reexport import later
 
 if TYPE_CHECKING:
     from jaximu.calibration import FieldStrength, MagneticLog
-    from jaximu.model.effects import Effect
 
 
 _NEAR_THE_EQUATOR = 20.0  # degrees of latitude within which the field may point up or down
@@ -65,16 +65,14 @@ class MagnetometerCommand(options.Reads):
         gravity, trace = self.local.value(), self.traced.value(self.logs)
         strength = _strength(self.field, self.local, self.longitude, trace)
         self.results.prepare()
-        from jaximu.calibration import calibrate_magnetometer, load_calibration
         from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
 
         with progress("reading"):
-            old = None if self.check is None else load_calibration(self.check)
-            base = None if self.calibration is None else load_calibration(self.calibration).inertial()
-            alike = self.log.alike(base or old)
+            old = None if self.check is None else jaximu.load_calibration(self.check)
+            base = None if self.calibration is None else jaximu.load_calibration(self.calibration).inertial()
             magnetic_logs = [
                 _read(stated, path, self.mag_log[k] if self.mag_log else None, self.mag_columns)
-                for k, (path, stated) in enumerate(alike.spread(self.logs))
+                for k, (path, stated) in enumerate(self.log.alike(base or old).spread(self.logs))
             ]
         southern = (
             None
@@ -82,7 +80,7 @@ class MagnetometerCommand(options.Reads):
             else self.local.latitude < 0
         )
         with progress("calibrating"):
-            result, measurement, heading = calibrate_magnetometer(
+            result, measurement, heading = jaximu.magnetometer(
                 magnetic_logs, strength, base, gravity, southern, effects
             )
         shift = None if old is None else check_magnetometer(old, result)
@@ -113,7 +111,7 @@ def _strength(
     return options.field_strength(text)
 
 
-def _effect(text: str) -> Effect:
+def _effect(text: str) -> jaximu.Effect:
     from jaximu.calibration.calibration import effect_named
 
     name, _, inner = text.partition(":")

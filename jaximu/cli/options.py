@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar, da
 
 from tyro.conf import Positional, Suppress, UseAppendAction, arg
 
+import jaximu
 from jaximu.cli.messages import progress, say
 from jaximu.ground.atomic import write_folder
 from jaximu.ground.document import Json
@@ -26,14 +27,11 @@ from jaximu.ground.reexport import later
 from jaximu.ground.units import SENSOR_QUANTITIES
 
 if TYPE_CHECKING:
-    from jaximu.calibration import Calibration
     from jaximu.ground.document import Document
     from jaximu.ground.page import Page
     from jaximu.model.noise_model import NoiseModel
     from jaximu.noise.stated import SensorNoise
-    from jaximu.recordings.readers import ReadOptions
     from jaximu.recordings.recording import Recording
-    from jaximu.recordings.segmentation import SegmentationOptions
 
 
 _TYRO = "tyro"
@@ -143,7 +141,7 @@ class LogOptions:
     stamp: str = option("{header,receive}", "Time of a message: the sensor's own or the logger's.", "header")
     like: Suppress[Any] = field(default=None, repr=False)  # no option: see `alike`
 
-    def alike(self, calibration: Calibration | None) -> LogOptions:
+    def alike(self, calibration: jaximu.Calibration | None) -> LogOptions:
         """Return the options for a log that is to be read as a calibration's was."""
         if calibration is None or calibration.reading is None:
             return self
@@ -165,12 +163,11 @@ class LogOptions:
     def read(self, path: Path, gravity: LocalGravity = STANDARD, check: bool = True, alone: bool = False) -> Recording:
         """Read one log; with `alone` it may hold a gyroscope and nothing else."""
         require_files(path, self.gyro_log)
-        from jaximu.recordings.readers import read_recording
 
         gyroscope = self.with_gyroscope(path).gyro_log
         if gyroscope != self.gyro_log:
             say(f"{gyroscope} is read: it lies beside the log.")
-        recording = read_recording(path, gyroscope, self.reading(gravity, check, alone))
+        recording = jaximu.read_recording(path, gyroscope, self.reading(gravity, check, alone))
         if self.like is not None:
             names = [name for name in ("columns", "gyro_columns", "axes") if getattr(self, name) is None]
             taken = typed(LogOptions(**{name: getattr(recording.reading, name) for name in names}))
@@ -178,12 +175,10 @@ class LogOptions:
                 say(f"{path} is read as the calibrated log was:{taken}.")
         return recording
 
-    def reading(self, gravity: LocalGravity = STANDARD, check: bool = True, alone: bool = False) -> ReadOptions:
+    def reading(self, gravity: LocalGravity = STANDARD, check: bool = True, alone: bool = False) -> jaximu.ReadOptions:
         """Return what the library asks for."""
-        from jaximu.recordings.readers import ReadOptions
-
-        stated = {option.name: getattr(self, option.name) for option in fields(self) if option.name != "gyro_log"}
-        return ReadOptions(**stated, gravity=gravity, check=check, alone=alone)
+        stated = {name: value for name, value in vars(self).items() if name != "gyro_log"}
+        return jaximu.ReadOptions(**stated, gravity=gravity, check=check, alone=alone)
 
     def read_unit(
         self,
@@ -225,8 +220,8 @@ class LogOptions:
 
         Raises `InputError` where their numbers differ.
         """
-        layouts = [self.columns] if self.columns is None else self.columns.split(";")
-        devices = [self.device] if self.device is None else self.device.split(",")
+        layouts = [None] if self.columns is None else self.columns.split(";")
+        devices = [None] if self.device is None else self.device.split(",")
         count = max(map(len, (paths, layouts, devices)))
         for option, parts in (("--columns", layouts), ("--device", devices), ("LOG", paths)):
             if len(parts) not in (1, count):
@@ -294,11 +289,9 @@ class PoseOptions:
     )
     minimum_duration: float = option("S", "Shortest pose, in seconds.", 0.8)
 
-    def value(self) -> SegmentationOptions:
+    def value(self) -> jaximu.SegmentationOptions:
         """Return what the library asks for."""
-        from jaximu.recordings.segmentation import SegmentationOptions
-
-        return SegmentationOptions(threshold=self.threshold, minimum_duration=self.minimum_duration)
+        return jaximu.SegmentationOptions(threshold=self.threshold, minimum_duration=self.minimum_duration)
 
 
 @takes_options
@@ -323,8 +316,7 @@ class TraceOptions:
         path = self.trace if self.trace is not None or not logs else sidecar(logs[0])
         if path is not None and self.trace is None:
             say(f"{path} is read: it lies beside the log.")
-        stated = {option.name: getattr(self, option.name) for option in fields(self) if option.name != "trace"}
-        return read_trace(path, stated) or None
+        return read_trace(path, {name: value for name, value in vars(self).items() if name != "trace"}) or None
 
 
 @takes_options
@@ -458,9 +450,10 @@ class Results:
 
 def typed(group: LogOptions | GravityOptions | NoiseOptions) -> str:
     """Return the options of a group that were given, as one types them."""
-    options = ((option.name, getattr(group, option.name), option.default) for option in fields(group) if option.repr)
     return "".join(
-        f" --{name.replace('_', '-')} {shlex.quote(str(value))}" for name, value, default in options if value != default
+        f" --{option.name.replace('_', '-')} {shlex.quote(str(value))}"
+        for option in fields(group)
+        if option.repr and (value := getattr(group, option.name)) != option.default
     )
 
 

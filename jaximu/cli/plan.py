@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.cli.options import option, switch, takes_options
@@ -116,14 +117,13 @@ def _known(path: Path, log: options.LogOptions, local: options.GravityOptions) -
 
     Second, what its magnetometer lacks, where it has one; the first is None where it has nothing else.
     """
-    from jaximu.calibration import calibrate, load_calibration
     from jaximu.planning import Known
     from jaximu.simulation import read_specification
 
     if options.beginning(path).lstrip()[:1] == b"{":
         if local != options.LOCAL:
             raise InputError(f"{path} states the gravity it was made with: leave --gravity and --latitude out.")
-        calibration, magnetometer = load_calibration(path), None
+        calibration, magnetometer = jaximu.load_calibration(path), None
         directions = (calibration.magnetic or {}).get("next")
         if directions is not None:
             from jaximu.report.magnetometer import next_words
@@ -142,4 +142,4 @@ def _known(path: Path, log: options.LogOptions, local: options.GravityOptions) -
     except InputError as error:
         raise InputError(f"{path} is neither a calibration nor a specification, and as a log: {error}") from error
     with progress("calibrating"):
-        return Known.from_calibration(calibrate(recordings, gravity), str(path)), None
+        return Known.from_calibration(jaximu.calibrate(recordings, gravity), str(path)), None

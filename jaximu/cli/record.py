@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import UseAppendAction
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
 from jaximu.cli.options import option, switch, takes_options
@@ -20,7 +21,6 @@ from jaximu.ground.errors import InputError, JaximuError
 if TYPE_CHECKING:
     from jaximu.planning.guide import Guide, Moment
     from jaximu.recordings.readers.stream import Lines
-    from jaximu.recordings.recording import Recording
 
 
 _FIRST = 100  # lines before the log is read for the first time
@@ -98,9 +98,7 @@ class RecordCommand(options.Reads):
                 say("The recording ended before the goal was reached; what there is is calibrated.")
             show(end="The recording has ended. Calibrating …")
             with progress("calibrating"):
-                from jaximu.calibration import calibrate
-
-                calibration = calibrate(self.log.read(path, gravity), gravity)
+                calibration = jaximu.calibrate(self.log.read(path, gravity), gravity)
             calibration = replace(calibration, trace=self.traced.value((path,)))
             self.results.present(calibration.summary, calibration=calibration)
             show(end=f"Calibrated: the report is {self.results.output / 'report.html'}")
@@ -160,7 +158,7 @@ def _record(lines: Lines, path: Path, log: options.LogOptions, guide: Guide, sho
     return False
 
 
-def _so_far(path: Path, log: options.LogOptions, count: int) -> Recording | None:
+def _so_far(path: Path, log: options.LogOptions, count: int) -> jaximu.Recording | None:
     """Read the log as it is by now; None while it is too short to be read."""
     try:
         return log.read(path, check=False)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.cli.options import option, takes_options
@@ -15,7 +16,6 @@ from jaximu.ground.reexport import later
 
 if TYPE_CHECKING:
     from jaximu.recordings.attitude import Attitude
-    from jaximu.recordings.recording import Recording
 
 
 @takes_options
@@ -47,11 +47,10 @@ class ReferenceCommand(options.Fits):
         options.require_files(self.reference)
         self.results.prepare(*options.INERTIAL)
         (recording,), known = self.log.read_unit((self.log_path,), gravity, self.noise)
-        from jaximu.calibration import calibrate_against_attitude
 
         attitude = read_reference(self.log_path if self.reference is None else self.reference, self.log_path, recording)
         with progress("calibrating"):
-            calibration, measurement = calibrate_against_attitude(
+            calibration, measurement = jaximu.reference(
                 recording,
                 attitude,
                 gravity,
@@ -65,7 +64,7 @@ class ReferenceCommand(options.Fits):
         )
 
 
-def read_reference(path: Path, log_path: Path, recording: Recording) -> Attitude:
+def read_reference(path: Path, log_path: Path, recording: jaximu.Recording) -> Attitude:
     """Read a measured attitude; one that is in the log itself is on its clock."""
     from jaximu.recordings.readers import read_attitude
 

@@ -69,15 +69,8 @@ class SimulateCommand:
                 for note in truth.notes:
                     say(f"{path}: {note}")
                 duration = case.plan.motion.length
-                written.append(
-                    {
-                        "file": str(path),
-                        "truth": f"{path}.truth.json",
-                        "samples": case.samples,
-                        "duration": duration,
-                        "notes": list(truth.notes),
-                    }
-                )
+                facts = {"samples": case.samples, "duration": duration, "notes": list(truth.notes)}
+                written.append({"file": str(path), "truth": f"{path}.truth.json"} | facts)
                 if not self.as_json:
                     say(f"{path}: {case.samples} samples, {duration:g} s")
         if self.as_json:
@@ -96,15 +89,8 @@ def _protocols() -> Page:
     parts = []
     for kind, protocol in PROTOCOLS.items():
         keys = [key.name + ("" if key.default is MISSING else f" = {_toml(key.default)}") for key in fields(protocol)]
-        parts.append(
-            Section(
-                kind,
-                (
-                    *[" ".join(paragraph.split()) for paragraph in (inspect.getdoc(protocol) or "").split("\n\n")],
-                    Code("\n".join(keys)),
-                ),
-            )
-        )
+        text = [" ".join(paragraph.split()) for paragraph in (inspect.getdoc(protocol) or "").split("\n\n")]
+        parts.append(Section(kind, (*text, Code("\n".join(keys)))))
     return Page("Protocols and their keys", (), first=parts)
 
 

@@ -7,6 +7,7 @@ from typing import Literal
 
 from tyro.conf import UseAppendAction
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.cli.options import option, switch, takes_options
@@ -47,12 +48,11 @@ class ThermalCommand(options.Fits):
         gravity = self.local.value()
         self.results.prepare(*options.INERTIAL)
         options.require_files(self.calibration)
-        from jaximu.calibration import calibrate_thermal, load_calibration
         from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
         from jaximu.recordings.flags import without_flagged
         from jaximu.report.export.thermal_autopilot import ardupilot_parameters, px4_parameters
 
-        base = None if self.calibration is None else load_calibration(self.calibration).inertial()
+        base = None if self.calibration is None else jaximu.load_calibration(self.calibration).inertial()
         recordings, known = self.log.alike(base).read_unit(self.logs, gravity, self.noise)
         recordings = [without_flagged(recording, path) for recording, path in zip(recordings, self.logs, strict=True)]
         by_hand = [turned_by_hand(recording) for recording in recordings]
@@ -67,7 +67,7 @@ class ThermalCommand(options.Fits):
             first = str(self.logs[by_hand.index(True)])
             raise InputError(f"{first} is poses by hand and others are a unit at rest: give one kind at a time.")
         with progress("fitting"):
-            thermal = calibrate_thermal(recordings, static=known, base=base, block=self.block)
+            thermal = jaximu.thermal(recordings, static=known, base=base, block=self.block)
             exports = {}
             if "px4" in self.to:
                 exports["px4.params"] = px4_parameters(thermal, self.sensor or 0, self.accel_id, self.gyro_id)

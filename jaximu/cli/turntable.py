@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import UseAppendAction
 
+import jaximu
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.cli.options import option, switch, takes_options
@@ -16,7 +17,6 @@ from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.recordings.entry import ScheduleEntry
-    from jaximu.recordings.recording import Recording
 
 
 @takes_options
@@ -65,11 +65,10 @@ class TurntableCommand(options.Fits):
         recordings, known = self.log.read_unit(self.logs, gravity, self.noise, alone=True)
         references = references_of(recordings, self.reference)
         with progress("calibrating"):
-            from jaximu.calibration.turntable import calibrate_turntable
             from jaximu.model.effects.earth_rotation import GyroEarthRotation
 
             wanted = (*self.fit, GyroEarthRotation.name) if self.earth_rotation == "fit" else self.fit
-            calibration = calibrate_turntable(
+            calibration = jaximu.turntable(
                 recordings,
                 references,
                 gravity,
@@ -83,16 +82,15 @@ class TurntableCommand(options.Fits):
         self.results.present(calibration.summary, calibration=calibration)
 
 
-def references_of(recordings: list[Recording], paths: Sequence[Path]) -> list[Sequence[ScheduleEntry]]:
+def references_of(recordings: list[jaximu.Recording], paths: Sequence[Path]) -> list[Sequence[ScheduleEntry]]:
     """Return the entries of each recording; a file of reference columns is put beside its recording's signals."""
     from jaximu.recordings.readers import read_reference
-    from jaximu.recordings.recording import Recording
     from jaximu.recordings.reference import entries_of_columns
 
     entries = []
     for index, recording in enumerate(recordings):
         read = read_reference(paths[index], recording) if paths else recording
-        if isinstance(read, Recording):
+        if isinstance(read, jaximu.Recording):
             recordings[index] = read
             read = entries_of_columns(read)
         entries.append(read)

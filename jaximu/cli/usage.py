@@ -219,8 +219,7 @@ def usage_mistake(name: str, command: type[Any], printed: str) -> InputError:
     _, *lines = [line for line in lines if line]  # a title, and perhaps a rule; what follows the next rule is advice
     rule = re.compile("[─-]{9,}")
     lines = list(itertools.dropwhile(rule.fullmatch, lines))
-    message = list(itertools.takewhile(lambda line: not rule.fullmatch(line), lines))
-    text = " ".join(message)
+    text = " ".join(itertools.takewhile(lambda line: not rule.fullmatch(line), lines))
     if match := _VALUE.search(text):
         kinds = {spelling: option.metavar for option in options_of(command) for spelling in option.names}
         kind = "a number" if "FLOAT" in text or "INT" in text else kinds.get(match["option"], "what it takes")
