@@ -15,13 +15,12 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.recordings.readers.parameters import ParameterFile
-from jaximu.report.export.autopilot import Autopilot, Firmware, cubic, need_temperature, rotation_of
+from jaximu.report.export.autopilot import Firmware, cubic, need_temperature, rotation_of
 from jaximu.report.export.base import ExportedUnit, Written, comments, text_file
 
 SUFFIX = ".param"
 SUMMARY = "ArduPilot: INS_ACC*, INS_GYR* (offset; scale of the accelerometer), COMPASS_*"
 MAGNETIC = True
-_SHORT = {"accelerometer": "ACC", "gyroscope": "GYR"}
 
 
 class ArduPilot(Firmware):
@@ -36,21 +35,18 @@ class ArduPilot(Firmware):
     rotations: ClassVar = {38: (90.0, 68.8, 293.3), 41: (0.0, 7.0, 0.0), 42: (45.0, 0.0, 0.0), 43: (315.0, 0.0, 0.0)}
     custom: ClassVar = {100: ("AHRS_CUSTOM_", "PIT"), 101: ("CUST_ROT1_", "PITCH"), 102: ("CUST_ROT2_", "PITCH")}
     reference = 35.0  # °C
+    short: ClassVar = {"accelerometer": "ACC", "gyroscope": "GYR", "magnetometer": "COMPASS"}
+    patterns: ClassVar = {
+        "accelerometer": "INS_{sensor}{number}{word}_{axis}",
+        "gyroscope": "INS_{sensor}{number}{word}_{axis}",
+        "magnetometer": "{sensor}_{word}{number}_{axis}",
+    }
+    identity, orientation = "INS_{sensor}{number}_ID", "{sensor}_ORIENT{number}"
+    offset, scale, matrix, unit, rotated = "OFFS", "SCAL", ("OFS", "DIA", "ODI"), ("mGauss", 10.0), True
 
-    def tool(self, number: int) -> Autopilot:
-        """INS_ACCOFFS_X, INS_ACC2OFFS_X and so on."""
-        digit = _digit(number)
-        patterns = {
-            "accelerometer": f"INS_ACC{digit}{{word}}_{{axis}}",
-            "gyroscope": f"INS_GYR{digit}{{word}}_{{axis}}",
-            "magnetometer": f"COMPASS_{{word}}{digit}_{{axis}}",
-        }
-        orient = f"COMPASS_ORIENT{digit}"
-        return Autopilot(patterns, "OFFS", "SCAL", ("OFS", "DIA", "ODI"), orient, ("mGauss", 10.0), rotated=True)
-
-    def identity(self, triad: str, number: int) -> str:
-        """INS_ACC_ID, INS_ACC2_ID …"""
-        return f"INS_{_SHORT[triad]}{_digit(number)}_ID"
+    def label(self, number: int) -> str:
+        """INS_ACC, INS_ACC2, INS_ACC3."""
+        return str(number + 1) if number else ""
 
     def rotation(self, file: ParameterFile, triad: str, number: int) -> FloatArray:
         """That of the board; a sensor's own comes before its offsets."""
@@ -63,7 +59,7 @@ class ArduPilot(Firmware):
     def thermal(self, file: ParameterFile, triad: str, number: int, celsius: float | None) -> FloatArray:
         """p(T) − p(T_cal), p = 1e-6 (c1 d + c2 d² + c3 d³), d = T − 35 °C."""
         stem = f"INS_TCAL{number + 1}_"
-        short = _SHORT[triad]
+        short = self.short[triad]
         if file.value(f"{stem}ENABLE", 0.0) != 1:
             return np.zeros(3)
         celsius = need_temperature(file, f"{stem}ENABLE", celsius)
@@ -77,10 +73,6 @@ class ArduPilot(Firmware):
 FIRMWARE = ArduPilot()
 
 
-def _digit(number: int) -> str:
-    return str(number + 1) if number else ""
-
-
 def write(parameters: ExportedUnit) -> Written:
     """Write offsets and scales of sensor `instance` (0, 1 or 2)."""
     parameters = parameters.for_autopilot("ArduPilot")
@@ -88,7 +80,7 @@ def write(parameters: ExportedUnit) -> Written:
     number = parameters.instance or 0
     if number not in range(FIRMWARE.sensors):
         raise InputError(f"--instance: ArduPilot names its sensors 0, 1 and 2 here, not {number}.")
-    values, equation, corrections, rotation = FIRMWARE.tool(number).values(parameters)
+    values, equation, corrections, rotation = FIRMWARE.values(parameters)
     convention = (
         "ArduPilot subtracts the offset, then scales, in the sensor's axes; parameters are single precision (6e-8 of a "
         "value), and it refuses scales outside 0.8 to 1.2. "
@@ -97,5 +89,5 @@ def write(parameters: ExportedUnit) -> Written:
         "A DataFlash log holds values that the parameters in force have corrected already (IMU, ACC and GYR alike): "
         "give them (--in-force), unless INS_*OFFS were 0, INS_*SCAL 1 and AHRS_ORIENTATION 0 while recording."
     )
-    text = text_file([comments(parameters), *(f"{name},{value!r}" for name, value in values)])
-    return Written(text, convention + rotation, equation, corrections, parameters=parameters, values=dict(values))
+    text = text_file([comments(parameters), *(f"{name},{value!r}" for name, value in values.items())])
+    return Written(text, convention + rotation, equation, corrections, parameters=parameters, values=values)

@@ -102,13 +102,12 @@ class Composition:
                     else:
                         shift = scale[axis] * (before - after)
                         at_rest = _at_rest(name, shift, abs(shift) / gravity)
-                    half = None if f"{name} {part}" in data_sheet else Z95 * self._sigmas[parameter]
                     changes.append(
                         {
                             "parameter": parameter,
                             "in_force": before,
                             "new": after,
-                            "half_width": half,
+                            "half_width": None if f"{name} {part}" in data_sheet else Z95 * self._sigmas[parameter],
                             "at_rest": at_rest,
                         }
                     )
@@ -161,10 +160,10 @@ class Composition:
 
     def _parameters(self, name: str) -> list[list[str]]:
         """The names of a triad's offsets, and of its scales if it has some."""
-        tool = _firmware(self.to).tool(self.unit.instance or 0)
+        firmware, number = _firmware(self.to), self.unit.instance or 0
         return [
-            [tool.patterns[name].format(word=word, axis=axis) for axis in "XYZ"]
-            for word in [tool.offset, *([tool.scale] if name == "accelerometer" else [])]
+            [firmware.parameter(firmware.patterns[name], name, number, word=word, axis=axis) for axis in "XYZ"]
+            for word in [firmware.offset, *([firmware.scale] if name == "accelerometer" else [])]
         ]
 
     def _correction(self, name: str, file: ParameterFile) -> tuple[FloatArray, FloatArray]:

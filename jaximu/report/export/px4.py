@@ -9,19 +9,20 @@ beside it (xy, xz, yz), R the rotation ROT (Magnetometer.hpp, `Correct`).
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.recordings.readers.parameters import ParameterFile
-from jaximu.report.export.autopilot import Autopilot, Firmware, cubic, need_temperature, rotation_of
+from jaximu.report.export.autopilot import Firmware, cubic, need_temperature, rotation_of
 from jaximu.report.export.base import ExportedUnit, Written, comments, text_file
 
 SUFFIX = ".params"
 SUMMARY = "PX4: CAL_ACC*, CAL_GYRO* (offset; scale of the accelerometer), CAL_MAG*"
 MAGNETIC = True
 _REAL, _INTEGER = 9, 6  # MAV_PARAM_TYPE
-_SENSORS = {"accelerometer": "ACC", "gyroscope": "GYRO", "magnetometer": "MAG"}
 
 
 class PX4(Firmware):
@@ -33,26 +34,14 @@ class PX4(Firmware):
     """
 
     name, sensors, logs_numbers = "PX4", 4, False
-
-    def tool(self, number: int) -> Autopilot:
-        """CAL_ACCn_XOFF and so on."""
-        return Autopilot(
-            {name: f"CAL_{sensor}{number}_{{axis}}{{word}}" for name, sensor in _SENSORS.items()},
-            "OFF",
-            "SCALE",
-            ("OFF", "SCALE", "ODIAG"),
-            f"CAL_MAG{number}_ROT",
-            ("gauss", 0.01),
-            rotated=False,
-        )
-
-    def identity(self, triad: str, number: int) -> str:
-        """CAL_ACCn_ID."""
-        return f"CAL_{_SENSORS[triad]}{number}_ID"
+    short: ClassVar = {"accelerometer": "ACC", "gyroscope": "GYRO", "magnetometer": "MAG"}
+    patterns: ClassVar = dict.fromkeys(short, "CAL_{sensor}{number}_{axis}{word}")
+    identity, orientation = "CAL_{sensor}{number}_ID", "CAL_{sensor}{number}_ROT"
+    offset, scale, matrix, unit, rotated = "OFF", "SCALE", ("OFF", "SCALE", "ODIAG"), ("gauss", 0.01), False
 
     def rotation(self, file: ParameterFile, triad: str, number: int) -> FloatArray:
         """The level adjustment after the rotation."""
-        parameter = f"CAL_{_SENSORS[triad]}{number}_ROT"
+        parameter = self.parameter(self.orientation, triad, number)
         if parameter not in file.values:
             raise InputError(
                 f"{file.path}: has no {parameter}, so the sensor's rotation is not known: a PX4 without it numbers "
@@ -65,7 +54,7 @@ class PX4(Firmware):
 
     def thermal(self, file: ParameterFile, triad: str, number: int, celsius: float | None) -> FloatArray:
         """X0 + X1 d + X2 d² + X3 d³, d = T − TREF."""
-        letter = _SENSORS[triad][0]
+        letter = self.short[triad][0]
         identity = self.identities(file, triad)[number]
         stems = (f"TC_{letter}{at}_" for at in range(self.sensors))
         stem = next((stem for stem in stems if file.value(f"{stem}ID", 0.0) == identity), None)
@@ -84,15 +73,16 @@ def write(parameters: ExportedUnit) -> Written:
     """Write offsets and scales of sensor `instance`; its device's ID only if it was stated."""
     parameters = parameters.for_autopilot("PX4")
     parameters.require_si("PX4")
-    number = parameters.instance or 0
-    values, equation, corrections, rotation = FIRMWARE.tool(number).values(parameters)
-    devices = [_SENSORS[name] for name in ("accelerometer", "gyroscope") if name in parameters.triads]
-    mine = devices or ["MAG"]  # a magnetometer is a device of its own
-    left = [] if parameters.device is not None else [*mine]
-    left += ["MAG"] if devices and "magnetometer" in parameters.triads else []
-    rows = [f"1\t1\t{name}\t{value!r}\t{_REAL}" for name, value in values]
+    values, equation, corrections, rotation = FIRMWARE.values(parameters)
+    identities = {
+        name: FIRMWARE.parameter(FIRMWARE.identity, name, parameters.instance or 0) for name in parameters.triads
+    }
+    mine = [name for name in identities if name != "magnetometer"] or [*identities]  # a magnetometer is another device
+    rows = [f"1\t1\t{name}\t{value!r}\t{_REAL}" for name, value in values.items()]
+    left = [*identities.values()]
     if parameters.device is not None:
-        rows += [f"1\t1\tCAL_{sensor}{number}_ID\t{parameters.device}\t{_INTEGER}" for sensor in mine]
+        rows += [f"1\t1\t{identities[name]}\t{parameters.device}\t{_INTEGER}" for name in mine]
+        left = [identity for name, identity in identities.items() if name not in mine]
     head = [comments(parameters), "# Vehicle-Id Component-Id Name Value Type"]
     convention = (
         "PX4 subtracts the offset, then scales, in the sensor's own axes before its rotation; parameters are single "
@@ -105,9 +95,7 @@ def write(parameters: ExportedUnit) -> Written:
     convention += rotation
     if left:
         convention += (
-            f" PX4 uses them only where {' and '.join(f'CAL_{sensor}{number}_ID' for sensor in left)} are the sensor's:"
-            " these are left as they are; state --device to write one device's."
+            f" PX4 uses them only where {' and '.join(left)} are the sensor's: these are left as they are; state "
+            "--device to write one device's."
         )
-    return Written(
-        text_file([*head, *rows]), convention, equation, corrections, parameters=parameters, values=dict(values)
-    )
+    return Written(text_file([*head, *rows]), convention, equation, corrections, parameters=parameters, values=values)
