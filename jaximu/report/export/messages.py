@@ -28,10 +28,11 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import FilePath, InputError
 from jaximu.recordings.recording import Recording, Signal
 
-_BLOCK = 1 << 12  # messages that are made at once
 _NOT_HELD = -1.0
 _RATE, _FORCE = 13, 25  # places of a sensor_msgs/Imu's quantities among its 37 doubles; each is followed by covariance
 _TESLA = 1e-6
+_CDR, _FRAME = b"\0\1\0\0", b"\4\0\0\0imu\0"
+"""How a little-endian message begins, and the frame "imu" as a header has it."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def write_messages(calibration: Calibration, raw: Recording, corrected: Recordin
                 kinds = {stream.topic: stream.kind for stream in streams} | {"/diagnostics": _STATUS}
                 topics = {topic: bag.add_connection(topic, kind, typestore=types) for topic, kind in kinds.items()}
                 bag.write(topics["/diagnostics"], first, _status(calibration, types, first))
-                messages = (_messages(stream, types, start) for stream in streams)
+                messages = (_messages(stream, start) for stream in streams)
                 for stamp, topic, content in heapq.merge(*messages, key=itemgetter(0)):
                     bag.write(topics[topic], stamp, content)
             (next(temporary.glob("*.mcap")) if one_file else temporary).replace(target)
@@ -135,44 +136,13 @@ def _residual(calibration: Calibration, corrected: Recording) -> Iterator[_Strea
         yield _Stream("/imu/residual", "std_msgs/msg/Float64", signal.time, off[:, None])
 
 
-def _messages(stream: _Stream, types: Any, start: int) -> Iterator[tuple[int, str, bytes]]:
-    """Yield stamp (ns), topic and bytes of each message: one message's bytes, with stamp and numbers put in."""
-    size = 8 * stream.numbers.shape[1]
-    example = bytes(types.serialize_cdr(_example(stream, types), stream.kind))
+def _messages(stream: _Stream, start: int) -> Iterator[tuple[int, str, bytes]]:
+    """Yield stamp (ns), topic and bytes (CDR) of each message: its stamp and the name of the frame, then numbers."""
     stamps = start + np.round(1e9 * stream.time).astype(np.int64)
-    for first in range(0, len(stamps), _BLOCK):
-        some = stamps[first : first + _BLOCK]
-        numbers = stream.numbers[first : first + _BLOCK]
-        rows = np.tile(np.frombuffer(example, np.uint8), (len(some), 1))
-        rows[:, len(example) - size :] = np.ascontiguousarray(numbers, "<f8").view(np.uint8)
-        if stream.kind != "std_msgs/msg/Float64":  # it has no header
-            rows[:, 4:12] = np.stack(np.divmod(some, 10**9), axis=1).astype("<u4").view(np.uint8)
-        for stamp, row in zip(some.tolist(), rows, strict=True):
-            yield stamp, stream.topic, row.tobytes()
-
-
-def _example(stream: _Stream, types: Any) -> Any:
-    known = types.types
-    header = _header(types, 0)
-    zero = known["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-    make = known[stream.kind]
-    none = np.zeros(9)
-    match stream.kind.rpartition("/")[2]:
-        case "Imu":
-            return make(header, known["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0), none, zero, none, zero, none)
-        case "MagneticField":
-            return make(header, zero, none)
-        case "Temperature":
-            return make(header, 0.0, 0.0)
-        case "Vector3Stamped":
-            return make(header, zero)
-        case _:
-            return make(0.0)
-
-
-def _header(types: Any, stamp: int) -> Any:
-    time = types.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
-    return types.types["std_msgs/msg/Header"](time, "imu")
+    seconds = np.stack(np.divmod(stamps, 10**9), axis=1).astype("<u4")
+    headed = stream.kind != "std_msgs/msg/Float64"
+    for stamp, second, row in zip(stamps, seconds, stream.numbers.astype("<f8"), strict=True):
+        yield int(stamp), stream.topic, _CDR + (second.tobytes() + _FRAME) * headed + row.tobytes()
 
 
 def _status(calibration: Calibration, types: Any, stamp: int) -> bytes:
@@ -188,5 +158,6 @@ def _status(calibration: Calibration, types: Any, stamp: int) -> bytes:
     }
     values = [known["diagnostic_msgs/msg/KeyValue"](key, str(value)) for key, value in facts.items() if value]
     serial = str((calibration.trace or {}).get("serial", ""))
+    header = known["std_msgs/msg/Header"](known["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), "imu")
     status = known["diagnostic_msgs/msg/DiagnosticStatus"](level, "jaximu calibration", verdict, serial, values)
-    return bytes(types.serialize_cdr(known[_STATUS](_header(types, stamp), [status]), _STATUS))
+    return bytes(types.serialize_cdr(known[_STATUS](header, [status]), _STATUS))
