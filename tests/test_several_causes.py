@@ -25,7 +25,9 @@ def names(diagnosis):
     return {effect.name for effect in diagnosis.effects}
 
 
-@pytest.mark.parametrize("third", [CATALOGUE["gyro.quadratic"](6e-4 * SIGNS), CATALOGUE["gyro.bias_ramp"](3e-6 * SIGNS)])
+@pytest.mark.parametrize(
+    "third", [CATALOGUE["gyro.quadratic"](6e-4 * SIGNS), CATALOGUE["gyro.bias_ramp"](3e-6 * SIGNS)]
+)
 def test_three_strong_causes_are_named_together(third):
     """What the other two leave was taken for drift and unsteady hands, which hid the third."""
     found = jaximu.diagnose(recorded(SENSITIVITY, CURVED, third), EXACT)

@@ -40,7 +40,6 @@ _DISCRETE_UNITS = {
 _ORDER = ("gyroscope", "accelerometer", "magnetometer")
 """Whose noise matters most."""
 _AXES = ("x", "y", "z", "mean")
-_Content = Callable[[NoiseAnalysis, str], Iterable[Part]]
 _NONE = "The data supports none of N, B and K."
 Cell = tuple[float, float, float] | float
 
@@ -177,7 +176,7 @@ def allan_figure(analysis: NoiseAnalysis) -> Figure:
     figure = new_figure(5.0, max(6.2, 5.7 * len(analysis.axes)))
     panels = np.atleast_1d(figure.subplots(1, len(analysis.axes)))
     for panel, (name, axes) in zip(panels, analysis.axes.items(), strict=True):
-        _panel(panel, name, axes, DATASHEET_UNITS[SENSOR_QUANTITIES[name]]["B"])
+        _panel(panel, name, axes)
     handles = [Line2D([], [], color=colour, marker=".", label=f"{axis} axis") for axis, colour in AXES.items()]
     handles += [
         Line2D([], [], color="0.3", marker=".", linestyle="none", label="measured"),
@@ -197,14 +196,14 @@ def allan_figure(analysis: NoiseAnalysis) -> Figure:
     return figure
 
 
-def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> None:
+def _panel(panel: Axes, name: str, axes: Sequence[Identified]) -> None:
     from matplotlib.ticker import LogLocator
 
     quantity = SENSOR_QUANTITIES[name]
+    unit = DATASHEET_UNITS[quantity]["B"]
     factor = _factor(quantity, "B", unit)
     tau = axes[0].deviation.tau
     longest = tau[-1]
-    length = max(recorded_seconds(axes[0]), 2 * tau[-1])
     fine = np.geomspace(tau[0], longest, 200)
     for colour, fit in zip(AXES.values(), axes, strict=True):
         deviation = fit.deviation
@@ -221,7 +220,7 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
         panel.plot(fine, factor * fit.allan_deviation(fine), color=colour, linewidth=1.2, zorder=3)
     bottom = factor * min(min(fit.deviation.low.min(), fit.deviation.value.min()) for fit in axes) / 4
     top = factor * max(fit.deviation.value.max() for fit in axes) * 1.8
-    left, right = tau[0] / 1.4, length
+    left, right = tau[0] / 1.4, max(recorded_seconds(axes[0]), 2 * longest)
     panel.set(xscale="log", yscale="log", xlim=(left, right), ylim=(bottom, top))
     whole = np.geomspace(left, right, 600)
     total = factor * _mean_deviation(axes, np.clip(whole, tau[0], longest))
@@ -232,7 +231,6 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
         panel.plot(whole, line, "--", color="0.3", linewidth=0.9, zorder=2.5)
         _letter(panel, term, whole, line, total, bottom, top)
     panel.axvspan(longest, right, color="0.88", zorder=1)
-    narrow = math.log(right / longest) < 0.19 * math.log(right / left)
     panel.text(
         math.sqrt(longest * right),
         top / 1.15,
@@ -241,7 +239,7 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
         va="top",
         fontsize=8.5,
         color="0.35",
-        rotation=90 if narrow else 0,
+        rotation=90 if math.log(right / longest) < 0.19 * math.log(right / left) else 0,  # narrow
     )
     panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if top / bottom < 300 else (1.0,)))
     panel.yaxis.set_major_formatter("{x:g}")
@@ -285,9 +283,8 @@ def _headline(name: str, axes: Sequence[Identified]) -> str:
     quantity = SENSOR_QUANTITIES[name]
     white = mean_terms(axes).get("N")
     at, size = _lowest(axes)
-    bottom = f"lowest {_in_unit(size, quantity, 'B', 2)} at {number(at, 2)} s"
     first = "" if white is None else f"N = {_in_unit(white.value, quantity, 'N')}, "
-    return f"{name.capitalize()}: {first}{bottom}"
+    return f"{name.capitalize()}: {first}lowest {_in_unit(size, quantity, 'B', 2)} at {number(at, 2)} s"
 
 
 def kalibr_text(analysis: NoiseAnalysis) -> str:
@@ -337,9 +334,6 @@ def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
         "data sheets call the lowest point of the curve bias instability; B is the height of its flat part over 0.664.",
         _terms,
     )
-    numbers = _by_triad(
-        analysis, "For a Kalman filter", "Of the mean of the axes, in SI; Δt is one over the sample rate.", _filter
-    )
     return Page(
         f"Noise at rest: {file_names(analysis.files)}",
         [*_verdict(analysis)],
@@ -355,9 +349,14 @@ def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
                 "ramp), the bias itself wanders and longer averages no longer help. The squares of the dashed lines "
                 "add up to that of a solid one.",
             ),
-            _cautions(analysis),
+            Section("Before you rely on it", [*_cautions(analysis)]),
             terms,
-            numbers,
+            _by_triad(
+                analysis,
+                "For a Kalman filter",
+                "Of the mean of the axes, in SI; Δt is one over the sample rate.",
+                _filter,
+            ),
             *_limits(analysis),
         ),
         partial(_details, analysis, sources or [Source(path, "", 0) for path in analysis.files]),
@@ -368,25 +367,23 @@ def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
     )
 
 
-def _cautions(analysis: NoiseAnalysis) -> Section:
+def _cautions(analysis: NoiseAnalysis) -> Iterator[Statement]:
     poor = [name for name, axes in analysis.axes.items() if any(axis.excess for axis in axes)]
     missing = [name for name in INERTIAL_QUANTITIES if name not in {*analysis.axes, *analysis.unusable}]
-    cautions = []
     if poor:
-        cautions.append(
-            Statement(
-                "More than the five terms",
-                f"The five terms do not describe the {listed(poor)} completely; the intervals are widened for it, see "
-                "the notes.",
-                True,
-            )
+        yield Statement(
+            "More than the five terms",
+            f"The five terms do not describe the {listed(poor)} completely; the intervals are widened for it, see "
+            "the notes.",
+            True,
         )
     if missing:
-        cautions.append(Statement("Not recorded", f"The recording has no {listed(missing, 'and no')}.", True))
-    return Section("Before you rely on it", cautions)
+        yield Statement("Not recorded", f"The recording has no {listed(missing, 'and no')}.", True)
 
 
-def _by_triad(analysis: NoiseAnalysis, title: str, text: str, content: _Content) -> Section:
+def _by_triad(
+    analysis: NoiseAnalysis, title: str, text: str, content: Callable[[NoiseAnalysis, str], Iterable[Part]]
+) -> Section:
     return Section(
         title,
         [
@@ -443,8 +440,7 @@ def _limits(analysis: NoiseAnalysis) -> Iterator[Part]:
         else "One recording does not show how the bias changes from power-on to power-on, and the Allan deviation "
         "cannot see it. Give several recordings of the unit, lying alike: `jaximu allan LOG1 LOG2 LOG3 …`"
     )
-    rows = [row.row(row.meaning) for row in _repeatability_rows(analysis)]
-    yield Section("Repeatability", [text, Table(("sensor", "unit", *_AXES[:3]), rows)])
+    yield Section("Repeatability", [text, Table(("sensor", "unit", *_AXES[:3]), [*_repeatability_rows(analysis)])])
 
 
 def _details(analysis: NoiseAnalysis, sources: Sequence[Source]) -> Iterator[Part]:
@@ -467,11 +463,13 @@ def _details(analysis: NoiseAnalysis, sources: Sequence[Source]) -> Iterator[Par
         _filter_by_axis,
     )
     yield Section("For Kalibr", ["The same, as `imu.yaml`:", Code(kalibr_text(analysis))])
-    files = [(source.path, str(source.rows or ""), source.sha256) for source in sources]
     yield Section(
         "Where it comes from",
         [
-            Table(("file", "rows", "SHA-256"), files),
+            Table(
+                ("file", "rows", "SHA-256"),
+                [(source.path, str(source.rows or ""), source.sha256) for source in sources],
+            ),
             Table(
                 (),
                 [
@@ -525,11 +523,9 @@ def _filter_rows(numbers: FilterNumbers) -> list[tuple[str, str, str, str]]:
     ]
 
 
-def _repeatability_rows(analysis: NoiseAnalysis) -> list[TermRow]:
-    rows = []
+def _repeatability_rows(analysis: NoiseAnalysis) -> Iterator[tuple[str, ...]]:
     for name, table in analysis.repeatability.items():
         quantity = SENSOR_QUANTITIES[name]
         for unit in _units(quantity, "B"):
             cells = tuple(map(tuple, _factor(quantity, "B", unit) * np.asarray(table)))
-            rows.append(TermRow("B", name, unit, cells, unit == DATASHEET_UNITS[quantity]["B"]))
-    return rows
+            yield TermRow("B", name, unit, cells, unit == DATASHEET_UNITS[quantity]["B"]).row(name)

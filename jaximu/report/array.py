@@ -12,7 +12,7 @@ from jaximu.calibration.array_units import Array, ArrayUnit
 from jaximu.ground.page import Page, Picture, Statement, Table
 from jaximu.ground.quantities import number, with_interval
 from jaximu.report.canvas import Figure
-from jaximu.report.figures import AXES, dressed, new_figure
+from jaximu.report.figures import AXES, beside, dressed
 
 
 def page_of(array: Array) -> Page:
@@ -92,9 +92,7 @@ def _table(array: Array) -> Table:
 
 
 def _row(unit: ArrayUnit, first: bool) -> tuple[str, ...]:
-    position = ", ".join(
-        with_interval(1e3 * value, 1e3 * sigma) for value, sigma in zip(unit.position, unit.position_sigma, strict=True)
-    )
+    position = ", ".join(map(with_interval, 1e3 * unit.position, 1e3 * unit.position_sigma))
     angle = np.degrees(2 * np.arccos(min(1.0, abs(unit.rotation[0]))))
     return (
         Path(unit.name).name,
@@ -112,8 +110,7 @@ def _scatter(value: float | None, factor: float) -> str:
 
 
 def _figure(array: Array) -> Figure:
-    figure = new_figure(4.6)
-    panels = figure.subplots(1, 2)
+    figure, panels = beside(2, 4.6)
     positions = np.array([unit.position for unit in array.units])
     extent = max(np.ptp(positions, axis=0).max(), 5e-3)
     for panel, (across, up), title in zip(panels, ((0, 1), (0, 2)), ("From above", "From the side"), strict=True):
@@ -127,8 +124,8 @@ def _figure(array: Array) -> Figure:
                 panel.annotate(label, 1e3 * position, (5, -5), textcoords="offset points", va="top", fontsize=9)
         panel.set_aspect("equal", adjustable="datalim")
         panel.margins(0.2)
-        labels = {f"{name}label": f"{'xyz'[axis]} of the first unit [mm]" for name, axis in (("x", across), ("y", up))}
-        dressed(panel, title, **labels)
+        horizontal, vertical = (f"{'xyz'[axis]} of the first unit [mm]" for axis in (across, up))
+        dressed(panel, title, xlabel=horizontal, ylabel=vertical)
     return figure
 
 

@@ -14,7 +14,7 @@ from jaximu.ground.page import Page, Picture, Statement
 from jaximu.ground.quantities import Z95, sentence, unit_text, with_interval
 from jaximu.report.calibration import calibration_page
 from jaximu.report.canvas import Figure
-from jaximu.report.figures import AFTER, BEFORE, dressed, legend, stacked, zero_line
+from jaximu.report.figures import AFTER, BEFORE, dressed, legend, stacked
 from jaximu.report.words import gravity_statements, limits
 
 _PANELS = {
@@ -37,12 +37,12 @@ def mounting_words(calibration: Calibration) -> Iterator[str]:
     assert alignment is not None
     offset = alignment["time_offset"]
     delay = 1e3 * offset["value"]
-    yield from [
+    yield (
         f"The reference's stamps are {abs(delay):.3g} ± {1.96e3 * offset['sigma']:.2g} ms "
-        f"{'late' if delay > 0 else 'early'} where the log begins.",
-        f"The unit is turned by {np.degrees(2 * np.arccos(min(1.0, abs(alignment['rotation'][0])))):.3g}° relative to "
-        "the body of the reference.",
-    ]
+        f"{'late' if delay > 0 else 'early'} where the log begins. The unit is turned by "
+        f"{np.degrees(2 * np.arccos(min(1.0, abs(alignment['rotation'][0])))):.3g}° relative to the body of the "
+        "reference."
+    )
     mounting, covariance = fitted_mounting(calibration.imu, calibration.names, calibration.covariance)
     if sigma := np.sqrt(covariance.clock_scale[0, 0]):
         yield (
@@ -50,15 +50,11 @@ def mounting_words(calibration: Calibration) -> Iterator[str]:
             f"{'fast' if mounting.clock_scale > 0 else 'slow'} against the reference's."
         )
     wide = alignment["filter"]["variance"]
-    sigma = alignment["filter"]["sigma"]
-    most, least = (1e3 * np.sqrt(max(abs(wide) + times * Z95 * sigma, 0.0)) for times in (1, -1))
-    if least and wide > 0:
-        yield f"The reference is smoothed as by a first-order lag of {least:.3g} to {most:.3g} ms (95 %)."
-    elif least:
-        yield (
-            f"The gyroscope is smoothed as by a first-order lag of {least:.3g} to {most:.3g} ms (95 %) beyond "
-            "the reference."
-        )
+    half = Z95 * alignment["filter"]["sigma"]
+    least, most = (1e3 * np.sqrt(max(abs(wide) + end, 0.0)) for end in (-half, half))
+    if least:
+        smoothed, beyond = ("reference", "") if wide > 0 else ("gyroscope", " beyond the reference")
+        yield f"The {smoothed} is smoothed as by a first-order lag of {least:.3g} to {most:.3g} ms (95 %){beyond}."
     else:
         yield f"No filter of the reference shows; a first-order lag is below {most:.3g} ms."
     if arm := alignment["lever_arm"]:
@@ -69,17 +65,13 @@ def mounting_words(calibration: Calibration) -> Iterator[str]:
     yield f"The reference's vertical is off by {np.degrees(np.linalg.norm(mounting.tilt)):.2g}°."
 
 
-def share_words(calibration: Calibration) -> list[str]:
-    """Say what the misfit is made of, as it was estimated."""
-    return [
+def page_of(calibration: Calibration, measurement: AgainstAttitude) -> Page:
+    """Return the page of a calibration against a measured attitude."""
+    shares = [
         f"{words}: {factor * unit * np.sqrt(size):.2g} {spoken}"
         for name, (words, unit, factor, spoken) in _SIZES.items()
         if (size := calibration.excess.get(name, 0.0)) > 0
     ]
-
-
-def page_of(calibration: Calibration, measurement: AgainstAttitude) -> Page:
-    """Return the page of a calibration against a measured attitude."""
     return calibration_page(
         calibration,
         [
@@ -96,7 +88,7 @@ def page_of(calibration: Calibration, measurement: AgainstAttitude) -> Page:
             Statement("The reference", " ".join(mounting_words(calibration))),
             Statement(
                 "What the misfit is made of",
-                f"{sentence('; '.join(share_words(calibration)))}. The intervals contain all of it.",
+                f"{sentence('; '.join(shares))}. The intervals contain all of it.",
             ),
         ],
     )
@@ -112,8 +104,7 @@ def _figure(calibration: Calibration, measurement: AgainstAttitude) -> Figure:
             time, values, unit = errors[name]
             panel.plot(time, values, ".", color=colour, markersize=4)
             panel.plot([], [], ".", color=colour, label=label)
-            dressed(panel, title, ylabel=f"error [{unit_text(unit)}]")
-        zero_line(panel)
+        dressed(panel, title, 0.0, ylabel=f"error [{unit_text(unit)}]")
     legend(panels[0], 2, "upper right")
     panels[-1].set_xlabel("time [s]")
     return figure

@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from jaximu.diagnosis import COMMON_DRIFT, Attributed, Attribution, CommonDrift
+from jaximu.diagnosis import COMMON_DRIFT, Attributed, Attribution
 from jaximu.diagnosis.diagnosis import stated_instead
 from jaximu.ground.page import Page, Part, Picture, Statement, Table
 from jaximu.ground.quantities import counted, listed, number, probability, readable, sentence, size, unit_text
@@ -39,12 +39,13 @@ def _verdict(attribution: Attribution) -> Iterator[str]:
         sizes = listed([size(drift.size, "rad/s", 2) for drift in attribution.common])
         shares = [100 * drift.share for drift in attribution.common]
         share = f"{min(shares):.0f} %" if max(shares) - min(shares) < 1 else f"{min(shares):.0f} to {max(shares):.0f} %"
-        texts.insert(
-            0,
+        yield (
             f"All units drift together in {sessions}: one time course, by {sizes} in a usual axis, is {share} of the "
-            "drift of all gyroscope axes.",
+            "drift of all gyroscope axes."
         )
-    yield from texts or ["Nothing repeats over the sessions of a unit or over the units of a session."]
+    elif not texts:
+        yield "Nothing repeats over the sessions of a unit or over the units of a session."
+    yield from texts
     open_units = [part.unit for part in attribution.recordings if part.diagnosis["verdict"] == "unexplained"]
     if open_units:
         where = listed([unit for unit in attribution.units if unit in open_units])
@@ -139,18 +140,17 @@ def _short(diagnosis: dict) -> str:
 
 
 def _drift_figure(attribution: Attribution) -> Figure:
-    drifts: Sequence[CommonDrift] = attribution.drifts
+    drifts = attribution.drifts
     factor, unit = readable("rad/s", max(drift.size for drift in drifts))
     figure, grid = figures.stacked(len(drifts), 2.0, 1.0, sharex=True, sharey=True)
     for axes, drift in zip(grid, drifts, strict=True):
         for line in drift.axes:
             axes.plot(drift.times, factor * line, color=figures.BEFORE, linewidth=0.6, alpha=0.5)
-        there = drift in attribution.common
-        axes.plot(drift.times, factor * drift.curve, color=figures.AFTER if there else figures.FLAGGED, linewidth=2)
-        figures.zero_line(axes)
-        figures.dressed(axes)
-        text = "more in common than independent drift" if there else "no more in common than independent drift"
-        axes.set_title(f"session {drift.session}: {text}, p {probability(drift.p_value)}", loc="left", fontsize=9)
+        more, color = ("more", figures.AFTER) if drift in attribution.common else ("no more", figures.FLAGGED)
+        axes.plot(drift.times, factor * drift.curve, color=color, linewidth=2)
+        figures.dressed(axes, level=0.0)
+        text = f"{more} in common than independent drift, p {probability(drift.p_value)}"
+        axes.set_title(f"session {drift.session}: {text}", loc="left", fontsize=9)
         axes.set_ylabel(f"rate ({unit_text(unit)})", fontsize=8)
     spread = factor * max(float(np.abs(drift.curve).max()) for drift in drifts)
     grid[0].set_ylim(-2 * spread, 2 * spread)

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from collections import Counter
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -45,7 +46,7 @@ def page_of(budget: Budget) -> Page:
             ),
             Section(
                 "Sources, dominant first",
-                [Table(("source", "size (1σ)", "mean share of the variances", "most of"), source_rows(budget))],
+                [Table(("source", "size (1σ)", "mean share of the variances", "most of"), [*source_rows(budget)])],
             ),
             _parameters(budget),
             _limits(budget),
@@ -94,36 +95,29 @@ def amount(value: float, unit: str) -> str:
 
 def _reading_order(budget: Budget) -> list[int]:
     """Scales, misalignments and biases of each triad together."""
-    kinds = ["1", "rad", "m/s^2", "rad/s"]
+    kinds = {"1": 0, "rad": 1, "m/s^2": 2, "rad/s": 3}
 
-    def key(index: int):
+    def key(index: int) -> tuple[str, int]:
         name = budget.names[index]
-        unit = budget.units[index]
-        return name.owner, kinds.index(unit) if name.effect is None and unit in kinds else len(kinds)
+        return name.owner, kinds.get(budget.units[index], 4) if name.effect is None else 4
 
     return sorted(range(len(budget.names)), key=key)
 
 
-def shares(budget: Budget) -> FloatArray:
-    """Return each source's share (s, p) of each parameter's variance."""
-    return budget.sigma**2 / np.maximum(np.sum(budget.sigma**2, axis=0), 1e-300)
-
-
 def _verdict(budget: Budget) -> Iterator[str]:
-    if budget.goals:
+    count = len(budget.goals)
+    if count:
         reached = sum(goal.reached for goal in budget.goals)
-        count = len(budget.goals)
-        if count == 1:
-            yield f"The goal is {'' if reached else 'not '}reached."
-        else:
-            yield f"{reached} of {count} goals are reached."
+        one = f"The goal is {'' if reached else 'not '}reached."
+        yield one if count == 1 else f"{reached} of {count} goals are reached."
     known = np.flatnonzero(budget.determined)
     if not len(known):
         yield "The scheme determines no parameter."
         return
-    count = np.bincount(shares(budget)[:, known].argmax(axis=0), minlength=len(budget.sources))
-    order = [int(row) for row in np.argsort(-count, kind="stable") if count[row]]
-    parts = [f"{budget.sources[row].words} for {count[row]}" for row in order]
+    counts = Counter(budget.shares[:, known].argmax(axis=0).tolist())
+    parts = [
+        f"{budget.sources[row].words} for {counts[row]}" for row in sorted(counts, key=lambda row: (-counts[row], row))
+    ]
     parts[0] = f"{parts[0]} of {counted(len(known), 'parameter')}"
     yield f"Largest source of uncertainty: {listed(parts)}."
     if lost := len(budget.names) - len(known):
@@ -137,11 +131,10 @@ def _number(budget: Budget) -> tuple[str, str]:
         return amount(
             _total(budget, goal), goal.unit
         ), f"standard deviation (1σ) of the {describe(goal.worst, budget.imu)}; its goal is {_wanted(goal)}"
-    known = budget.determined
-    if not budget.sources or not known.any():
+    if not budget.sources or not budget.determined.any():
         return "not determined", "the scheme determines no parameter"
     row = budget.order()[0]
-    return _percent(float(shares(budget)[row, known].mean())), (
+    return _percent(float(budget.shares[row, budget.determined].mean())), (
         f"of the parameters' variances, on average, come from the {budget.sources[row].words}"
     )
 
@@ -171,40 +164,33 @@ def _next(budget: Budget) -> str:
     return "`jaximu turntable LOG --reference schedule.csv -o RESULTS` calibrates a session on this set-up."
 
 
-def parameter_rows(budget: Budget) -> list[tuple[str, ...]]:
-    """Return each parameter in words, its 1σ, what it is made of (dominant first), and its 1σ by Monte Carlo."""
-    part = shares(budget)
+def parameter_rows(budget: Budget) -> Iterator[tuple[str, ...]]:
+    """Yield each parameter in words, its 1σ, what it is made of (dominant first), and its 1σ by Monte Carlo."""
+    part = budget.shares
     off = budget.nonlinear()
-    rows = []
     for index in _reading_order(budget):
         words = describe(budget.names[index], budget.imu)
         unit = budget.units[index]
         if not budget.determined[index]:
-            rows.append((words, "not determined", "", ""))
+            yield words, "not determined", "", ""
             continue
         ranked = [int(row) for row in (-part[:, index]).argsort(kind="stable") if part[row, index] >= LEAST_SHARE][:3]
         made = [f"{budget.sources[row].words} {100 * part[row, index]:.0f} %" for row in ranked]
-        wrong = [budget.sources[row].words for row, column in off if column == index]
-        made += [f"not linear in {source}" for source in wrong]
+        made += [f"not linear in {budget.sources[row].words}" for row, column in off if column == index]
         drawn = "" if budget.check is None else amount(budget.check.rms[index], unit)
-        rows.append((words, amount(budget.total[index], unit), ", ".join(made), drawn))
-    return rows
+        yield words, amount(budget.total[index], unit), ", ".join(made), drawn
 
 
-def source_rows(budget: Budget) -> list[tuple[str, ...]]:
-    """Return each source, dominant first: in words, its size, its mean share, and the parameter it has most of."""
-    part = shares(budget)
+def source_rows(budget: Budget) -> Iterator[tuple[str, ...]]:
+    """Yield each source, dominant first: in words, its size, its mean share, and the parameter it has most of."""
+    part = budget.shares
     known = np.flatnonzero(budget.determined)
-    rows = []
     for row in budget.order():
         source = budget.sources[row]
         most = int(known[part[row, known].argmax()]) if len(known) else 0
         mean = part[row, known].mean() if len(known) else 0.0
         where = f"{describe(budget.names[most], budget.imu)}: {_percent(part[row, most])}"
-        rows.append(
-            (source.words, _stated(source.size), _percent(mean), where if part[row, most] >= 1e-3 else "nowhere")
-        )
-    return rows
+        yield source.words, _stated(source.size), _percent(mean), where if part[row, most] >= 1e-3 else "nowhere"
 
 
 def _percent(share: float) -> str:
@@ -215,18 +201,15 @@ def nonlinear_words(budget: Budget) -> Iterator[str]:
     """Say where the linear budget is off by more than 5 %."""
     for row, index in budget.nonlinear():
         unit = budget.units[index]
-        linear = amount(budget.sigma[row, index], unit)
+        off = budget.off[row, index]
+        wrong = f"{100 * abs(off):.0f} % too {'small' if off > 0 else 'large'}"
+        if off > 1:
+            wrong = f"{number(1 + off, 2)} times too small"
         yield (
             f"{describe(budget.names[index], budget.imu)}: {budget.sources[row].words} reaches it with "
-            f"{amount(budget.actual[row, index], unit)} in the whole fit, {linear} to first order; its total of "
-            f"{amount(budget.total[index], unit)} is {_wrong(100 * budget.off[row, index])}."
+            f"{amount(budget.actual[row, index], unit)} in the whole fit, {amount(budget.sigma[row, index], unit)} to "
+            f"first order; its total of {amount(budget.total[index], unit)} is {wrong}."
         )
-
-
-def _wrong(change: float) -> str:
-    if change > 100:
-        return f"{number(1 + change / 100, 2)} times too small"
-    return f"{abs(change):.0f} % too {'small' if change > 0 else 'large'}"
 
 
 def goal_words(budget: Budget, goal: Goal) -> str:
@@ -247,8 +230,8 @@ def goal_words(budget: Budget, goal: Goal) -> str:
         return text + (f" Not enough by themselves: {', '.join(unable)}." if unable else "")
     if goal.together is None or goal.together.times is None:
         return text + "Improving all sources together is not enough."
-    both = [_smaller(sources[name], goal.together.times) for name in goal.together.sources]
-    return text + f"No single source is enough. Improve together: {'; '.join(both)}."
+    both = "; ".join(_smaller(sources[name], goal.together.times) for name in goal.together.sources)
+    return f"{text}No single source is enough. Improve together: {both}."
 
 
 def _smaller(source: ErrorSource, times: float) -> str:
@@ -266,7 +249,7 @@ def check_words(budget: Budget, check: Trials) -> str:
     ratio = check.rms[known] / budget.total[known]
     worst = int(np.abs(ratio - 1).argmax())
     chance = Z95 / np.sqrt(2 * check.draws)
-    failed = f" {check.failed} of them did not converge and are left out." if check.failed else ""
+    failed = f" {check.failed} of them did not converge and are left out." * bool(check.failed)
     return (
         f"{check.draws} sessions with all errors at once, through the whole estimator, scatter on average "
         f"{_compared(float(np.mean(ratio)))} as the budget says; farthest from it is the "
@@ -285,7 +268,7 @@ def _compared(ratio: float) -> str:
 def _figure(budget: Budget) -> Figure:
     owners = [name.owner for name in budget.names]
     columns = [group for group in _GROUPS if group in owners]
-    part = shares(budget)
+    part = budget.shares
     order = budget.order()
     visible = [row for row in order if (part[row, budget.determined] >= LEAST_SHARE).any()][: len(PALETTE)]
     stacked = [(budget.sources[row].words, part[row], color) for row, color in zip(visible, PALETTE, strict=False)]
@@ -299,9 +282,7 @@ def _figure(budget: Budget) -> Figure:
         _draw_bars(axes, budget, [index for index in _reading_order(budget) if owners[index] == group], stacked)
     legend_below(figure, figure.axes[0], 4)
     dominant = budget.sources[order[0]].words if order else "nothing"
-    figure.suptitle(
-        f"Where the uncertainty comes from: most of all {dominant}", x=0.01, ha="left", fontsize=12, fontweight="bold"
-    )
+    figures.headed(figure, f"Where the uncertainty comes from: most of all {dominant}")
     return figure
 
 

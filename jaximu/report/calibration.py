@@ -8,7 +8,6 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.data.stations import station_errors
 from jaximu.ground.page import Code, Page, Part, Picture, Section, Statement, Table
-from jaximu.ground.parameters import Parameter
 from jaximu.ground.quantities import Z95, change, counted, sentence, size, with_interval
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.report import figures, tables, words
@@ -70,8 +69,7 @@ def _stations_figure(calibration: Calibration) -> Figure:
             (-0.2, 0.0, 0.2), figures.AXES.items(), panel.error, panel.sigma, strict=True
         ):
             axes.errorbar(panel.station + shift, error, Z95 * sigma, fmt="o", ms=3.5, lw=0.8, color=color, label=axis)
-        figures.zero_line(axes)
-        figures.dressed(axes, _error_words(panel.name), ylabel=panel.unit)
+        figures.dressed(axes, _error_words(panel.name), 0.0, ylabel=panel.unit)
     figures.legend(grid[0], 3, "upper right")
     grid[-1].set_xlabel("pose or turn, in order of time (bars: 95 % of the noise)")
     return figure
@@ -161,8 +159,7 @@ def _number(calibration: Calibration) -> tuple[str, str]:
 
 def _determined(calibration: Calibration) -> Iterator[str]:
     count = len(calibration.names)
-    undetermined = sum(not direction.determined for direction in calibration.weak)
-    if undetermined:
+    if undetermined := sum(not direction.determined for direction in calibration.weak):
         what = f"{counted(undetermined, 'combination')} of the {count} parameters"
         yield f"The recording does not determine {what} (marked *)."
     elif calibration.weak:
@@ -191,7 +188,14 @@ def _parameters(calibration: Calibration) -> Iterator[Part]:
                 3,
             )
         )
-    others = [_effect_row(one) for one in calibration.parameters.values() if "effects" in one.name]
+    others = [
+        (
+            one.words + " *" * one.weak,
+            with_interval(one.value, one.sigma, one.unit) if one.determined else "not determined",
+        )
+        for one in calibration.parameters.values()
+        if "effects" in one.name
+    ]
     yield Section("Parameters", [*parts, Section("Effects", [Table(("number", "± 95 %"), others)], 3)])
     yield (
         "Gain K = S·(1 + M): scales S on the diagonal, misalignments M beside it (1 mrad is 0.1 % of the input); "
@@ -207,19 +211,14 @@ def _biases_of_the_recording(calibration: Calibration) -> str:
     means = []
     for name, sigma in calibration.bias_sigma_recording.items():
         if calibration.open_numbers.isdisjoint(f"{name}.bias[{axis}]" for axis in range(3)):
-            scale = calibration.triads()[name].scales
-            means.append(f"± {size(Z95 * float(np.max(sigma / scale)), SENSOR_UNITS[name], 2)} ({name})")
+            worst = float(np.max(sigma / calibration.triads()[name].scales))
+            means.append(f"± {size(Z95 * worst, SENSOR_UNITS[name], 2)} ({name})")
     return (
         "The biases, and their intervals, are for use after the recording, for as long again as it took and without "
         "another power-on."
         + f" As means over the recording itself they are known to {' and '.join(means)}, worst axis."
         * bool(means)
     )
-
-
-def _effect_row(parameter: Parameter) -> tuple[str, str]:
-    interval = with_interval(parameter.value, parameter.sigma, parameter.unit)
-    return parameter.words + " *" * parameter.weak, interval if parameter.determined else "not determined"
 
 
 def _equations(calibration: Calibration) -> Iterator[Part]:
@@ -235,15 +234,15 @@ def _equations(calibration: Calibration) -> Iterator[Part]:
 
 def _correlation(calibration: Calibration) -> Picture:
     shared = calibration.gravity.sigma > 0 and "accelerometer" in calibration.triads()
-    caption = (
+    return Picture(
+        "correlation",
+        partial(figures.correlation_figure, calibration),
+        "Correlation of the fitted parameters",
         "a: accelerometer, g: gyroscope; s_x: scale of axis x; m_yx: misalignment, input along x seen by output y; "
         "b_x: bias. Near ±1, the recording determines only the sum or difference of the two, and their single "
         "intervals are wide."
-    )
-    if shared:
-        caption += " The accelerometer's scales go together as far as they share the uncertainty of gravity."
-    return Picture(
-        "correlation", partial(figures.correlation_figure, calibration), "Correlation of the fitted parameters", caption
+        + " The accelerometer's scales go together as far as they share the uncertainty of gravity."
+        * bool(shared),
     )
 
 
@@ -265,6 +264,5 @@ def _origin(calibration: Calibration) -> Iterator[Part]:
     sources = [
         [str(file.get(key, "")) for key in ("file", "rows", "sha256")] for file in calibration.data.get("files", [])
     ]
-    if sources:
-        parts.append(Table(("file", "rows", "SHA-256"), sources))
-    yield Section("Where it comes from", [*parts, Table((), tables.provenance(calibration))])
+    parts += [Table(("file", "rows", "SHA-256"), sources), Table((), tables.provenance(calibration))]
+    yield Section("Where it comes from", parts)

@@ -71,8 +71,7 @@ def _verdict(verdict: str, items: Sequence[Item]) -> Iterator[str]:
     if verdict == PASS:
         yield "Every item conforms with its limits."
         return
-    rows = map(item_row, deciding[:3])
-    named = "; ".join(f"{row['name']} is {row['value']}, limits {row['limits']}" for row in rows)
+    named = "; ".join(f"{row['name']} is {row['value']}, limits {row['limits']}" for row in map(item_row, deciding[:3]))
     also = f"; and {counted(len(deciding) - 3, 'more item')}" if len(deciding) > 3 else ""
     subject = "Fails" if verdict == FAIL else "Cannot be decided"
     yield f"{subject}: {named}{also}."

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.page import Code, Items, Page, Part, Picture, Section, Statement, Table
+from jaximu.ground.page import Code, Items, Page, Picture, Section, Statement, Table
 from jaximu.ground.quantities import Z95, number, sentence
 from jaximu.navigation.consequences import Consequences, position
 from jaximu.navigation.estimator_noise import EstimatorNoise
@@ -27,6 +27,13 @@ def page_of(
     files: Mapping[str, bytes] = MappingProxyType({}),
 ) -> Page:
     """Return the budget of position over time; `noise` for estimators, by where it is from, and its `files`."""
+    tracks = Picture(
+        "tracks",
+        partial(_tracks_figure, consequences),
+        "Tracks of position error of all draws",
+        "Each line is one draw of all errors, through the whole mechanisation: a unit as good as this calibration "
+        "says. The ellipse holds 95 % of the draws if the budget is right.",
+    )
     return Page(
         f"Navigating by {Path(consequences.calibration_file).name} alone",
         _verdict(consequences),
@@ -46,7 +53,7 @@ def page_of(
             *_tables(consequences),
             *_for_estimators(noise, files),
         ),
-        partial(_tracks, consequences),
+        lambda: () if consequences.check is None else (tracks,),
         consequences.notes,
         _next(consequences),
     )
@@ -54,9 +61,9 @@ def page_of(
 
 def _verdict(consequences: Consequences) -> tuple[str, ...]:
     name = _order(consequences)[0]
-    total = _metres(_at_end(consequences.total))
     return (
-        f"Navigating by this unit alone, position is off by {total} (1σ) after {_end(consequences)}.",
+        f"Navigating by this unit alone, position is off by {_metres(_at_end(consequences.total))} (1σ) after "
+        f"{_end(consequences)}.",
         f"The largest term is {name}: {_metres(_at_end(consequences.terms[name]))} by itself.",
     )
 
@@ -67,17 +74,6 @@ def _next(consequences: Consequences) -> str:
     file = consequences.calibration_file
     file = shlex.quote(file) if Path(file).suffix else "CALIBRATION"
     return f"`jaximu plan {file} -o plan` plans the poses and turns that improve the calibration most."
-
-
-def _tracks(consequences: Consequences) -> Iterator[Part]:
-    if consequences.check is not None:
-        yield Picture(
-            "tracks",
-            partial(_tracks_figure, consequences),
-            "Tracks of position error of all draws",
-            "Each line is one draw of all errors, through the whole mechanisation: a unit as good as this calibration "
-            "says. The ellipse holds 95 % of the draws if the budget is right.",
-        )
 
 
 def _tables(consequences: Consequences) -> Iterator[Section]:
@@ -95,7 +91,7 @@ def _tables(consequences: Consequences) -> Iterator[Section]:
             )
         ],
     )
-    yield Section("All errors, by direction (1σ)", [Table(("", *times), _total_rows(consequences))])
+    yield Section("All errors, by direction (1σ)", [Table(("", *times), [*_total_rows(consequences)])])
 
 
 def _for_estimators(noise: Mapping[str, EstimatorNoise], files: Mapping[str, bytes]) -> Iterator[Section]:
@@ -154,19 +150,17 @@ def _budget_rows(consequences: Consequences) -> list[tuple[str, ...]]:
     return [*shown, *(row(name, consequences.terms[name]) for name in _order(consequences))]
 
 
-def _total_rows(consequences: Consequences) -> list[tuple[str, ...]]:
+def _total_rows(consequences: Consequences) -> Iterator[tuple[str, ...]]:
     rows = _places(consequences)
     sigma = np.sqrt(consequences.total)
-    shown = []
-    for part, what in enumerate(("position", "velocity", "attitude")):
+    parts = (
+        ("position, ", _metres),
+        ("velocity, ", lambda value: f"{_metres(value)}/s"),
+        ("attitude, about ", lambda value: f"{number(np.degrees(value), 2)}°"),
+    )
+    for part, (what, words) in enumerate(parts):
         for axis, direction in enumerate(("east", "north", "up")):
-            words = [
-                f"{number(np.degrees(value), 2)}°" if part == 2 else _metres(value)
-                for value in sigma[rows, 3 * part + axis]
-            ]
-            about = "about " if part == 2 else ""
-            shown.append((f"{what}, {about}{direction}", *(f"{word}/s" if part == 1 else word for word in words)))
-    return shown
+            yield what + direction, *map(words, sigma[rows, 3 * part + axis])
 
 
 def _statements(consequences: Consequences) -> list[Statement]:
@@ -267,8 +261,7 @@ def _budget_figure(consequences: Consequences) -> Figure:
 def _tracks_figure(consequences: Consequences) -> Figure:
     check = consequences.check
     assert check is not None
-    figure = figures.new_figure(4.6)
-    plane, height = figure.subplots(1, 2)
+    figure, (plane, height) = figures.beside(2, 4.6)
     for track in check.errors[:100]:
         plane.plot(track[:, 0], track[:, 1], color="#0072B2", linewidth=0.6, alpha=0.4)
         height.plot(consequences.times, track[:, 2], color="#0072B2", linewidth=0.6, alpha=0.4)

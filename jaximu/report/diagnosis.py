@@ -27,7 +27,7 @@ from jaximu.noise.deviations import deviation
 from jaximu.recordings.finding import Finding
 from jaximu.report import figures
 from jaximu.report.canvas import Axes, Figure
-from jaximu.report.figures import band, dressed, legend, zero_line
+from jaximu.report.figures import band, dressed, legend
 from jaximu.report.words import compensation, file_names
 
 Twin = Callable[[], tuple[Experiment, State]]
@@ -163,11 +163,12 @@ def _adequate(diagnosis: Diagnosis) -> str:
 
 
 def _causes(diagnosis: Diagnosis) -> str:
-    texts = []
-    for effect in diagnosis.effects:
-        rivals = " or ".join(map(effect_title, effect.rivals))
-        texts.append(effect.sentence() + (f", or {rivals} (this recording cannot tell them apart)" if rivals else ""))
-    return "; ".join(texts)
+    return "; ".join(
+        effect.sentence()
+        + f", or {' or '.join(map(effect_title, effect.rivals))} (this recording cannot tell them apart)"
+        * bool(effect.rivals)
+        for effect in diagnosis.effects
+    )
 
 
 def gained(diagnosis: Diagnosis) -> str:
@@ -208,13 +209,11 @@ def _number(diagnosis: Diagnosis) -> tuple[str, str]:
     index = _shown_kind(diagnosis)
     shown = diagnosis.experiment.real.kinds[index]
     measured = rms(diagnosis.experiment.errors(diagnosis.base)[index])
-    if diagnosis.verdict == "adequate":
-        meaning = f"rms of {shown.words}: no more than noise, drift and handling leave"
-    else:
-        present = np.unique(diagnosis.experiment.real.kind).tolist()
-        times = np.sqrt(diagnosis.checks[present.index(index)].statistic)
-        meaning = f"rms of {shown.words}, {number(times, 2)} × what noise, drift and handling leave"
-    return size(measured, shown.unit, 2), meaning
+    meaning = ": no more than noise, drift and handling leave"
+    if diagnosis.verdict != "adequate":
+        times = np.sqrt(diagnosis.checks[np.unique(diagnosis.experiment.real.kind).tolist().index(index)].statistic)
+        meaning = f", {number(times, 2)} × what noise, drift and handling leave"
+    return size(measured, shown.unit, 2), f"rms of {shown.words}{meaning}"
 
 
 def _next(diagnosis: Diagnosis) -> str:
@@ -258,10 +257,8 @@ def _lines_figure(diagnosis: Diagnosis) -> Figure:
     lines = {}
     for one in diagnosis.lines:
         lines.setdefault((one.recording, one.triad, one.line.axis), []).append(one)
-    axes_of = list(lines)[:_PANELS]
-    figure, grid = figures.stacked(len(axes_of), 2.4, 0.6)
-    for axes, key in zip(grid, axes_of, strict=True):
-        mine = lines[key]
+    figure, grid = figures.stacked(min(len(lines), _PANELS), 2.4, 0.6)
+    for axes, (key, mine) in zip(grid, lines.items(), strict=False):
         times, power = spectrum_at_rest(parts[key[0]], *key[1:])
         axes.pcolormesh(
             times,
@@ -484,8 +481,7 @@ def _shown_kind(diagnosis: Diagnosis) -> int:
 
 def _lead(diagnosis: Diagnosis, twin: Twin) -> Figure:
     simulated, refit = twin()
-    figure = figures.new_figure(4.3)
-    left, right = figure.subplots(1, 2, width_ratios=[1.35, 1])
+    figure, (left, right) = figures.beside(2, 4.3, width_ratios=[1.35, 1])
     kind = _shown_kind(diagnosis)
     experiment = diagnosis.experiment
     shown = experiment.real.kinds[kind]
@@ -496,9 +492,7 @@ def _lead(diagnosis: Diagnosis, twin: Twin) -> Figure:
     for label, colour, source, state in series:
         time = source.real.dependences(kind)[TIME]  # a twin need not have as many poses and turns
         left.plot(time, factor * source.errors(state)[kind], "o", color=colour, markersize=4, label=label)
-    zero_line(left)
-    dressed(left, shown.words, xlabel="time [s]", ylabel=f"error [{unit}]")
-    legend(left)
+    dressed(left, shown.words, 0.0, 1, xlabel="time [s]", ylabel=f"error [{unit}]")
     _ranking(right, diagnosis)
     return figure
 
@@ -552,24 +546,15 @@ def _dependence(diagnosis: Diagnosis, twin: Twin) -> Figure:
 def _learned(learned: LearnedTerm) -> Figure:
     unit, factor, shift = learned.effect.covariate_unit, 1.0, 0.0
     if learned.effect.words == "temperature":
-        unit = "°C"
-        shift = ZERO_CELSIUS
+        unit, shift = "°C", ZERO_CELSIUS
     elif unit == "rad/s":
-        unit = "°/s"
-        factor = np.degrees(1.0)
+        unit, factor = "°/s", np.degrees(1.0)
     scale, label = readable(SENSOR_UNITS[learned.triad], _AN_ERROR)
-    figure = figures.new_figure(2.8)
-    panels = figure.subplots(1, 3, sharey=True)
+    figure, panels = figures.beside(3, 2.8, sharey=True)
     for axis, panel in enumerate(panels):
-        band(
-            panel,
-            factor * learned.x - shift,
-            scale * learned.y[:, axis],
-            scale * learned.half_width[:, axis],
-            _EXTENDED,
-        )
-        zero_line(panel)
-        dressed(panel, f"{learned.triad} {'xyz'[axis]}", xlabel=f"{learned.covariate} [{unit.replace('^2', '²')}]")
+        value, half = (scale * values[:, axis] for values in (learned.y, learned.half_width))
+        band(panel, factor * learned.x - shift, value, half, _EXTENDED)
+        dressed(panel, f"{learned.triad} {'xyz'[axis]}", 0.0, xlabel=f"{learned.covariate} [{unit.replace('^2', '²')}]")
         panel.xaxis.label.set_size(8)
     panels[0].set_ylabel(f"[{label}]")
     return figure

@@ -63,10 +63,8 @@ def statements(noise: EstimatorNoise) -> Iterator[Statement]:
 def _table(noise: EstimatorNoise) -> Table:
     rows = []
     for name, triad in noise.triads.items():
-        texts = [
-            f"{number(middle)} ({number(low)} to {number(high)})"
-            for middle, low, high in zip(triad.multiplier, triad.low, triad.high, strict=True)
-        ]
+        intervals = zip(triad.multiplier, triad.low, triad.high, strict=True)
+        texts = ("{} ({} to {})".format(*map(number, interval)) for interval in intervals)
         rows.append((f"{name}, N times (95 %)", *texts))
         rows += [
             (f"– {term}", *(f"{value:.2f}" for value in values))

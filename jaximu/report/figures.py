@@ -75,8 +75,21 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def dressed(axes: Axes, title: str = "", **labels: Any) -> None:
-    """Draw a panel's frame, grid, title and labels as all have them."""
+def beside(count: int, height: float, **shared: Any) -> tuple[Figure, list[Any]]:
+    """Return a figure with so many panels beside each other."""
+    figure = new_figure(height)
+    return figure, figure.subplots(1, count, squeeze=False, **shared)[0].tolist()
+
+
+def dressed(axes: Axes, title: str = "", level: float | None = None, key: int = 0, **labels: Any) -> None:
+    """Draw a panel's frame, grid, title and labels as all have them.
+
+    **Arguments:** `level`: the one that errors lie about; `key`: how many columns its key has, where it shows one.
+    """
+    if level is not None:
+        axes.axhline(level, color="0.6", linewidth=0.8)
+    if key:
+        legend(axes, key)
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(True, color="#E3E3E3", linewidth=0.6)
     axes.set_axisbelow(True)
@@ -86,9 +99,9 @@ def dressed(axes: Axes, title: str = "", **labels: Any) -> None:
     axes.set(**labels)
 
 
-def zero_line(axes: Axes, value: float = 0.0) -> None:
-    """Draw the level that errors lie about."""
-    axes.axhline(value, color="0.6", linewidth=0.8)
+def headed(figure: Figure, title: str) -> None:
+    """Write the title of a whole figure."""
+    figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
 
 
 def legend(axes: Axes, columns: int = 1, where: Any = "best") -> None:
@@ -141,10 +154,9 @@ def envelope(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArr
         return time, values
     starts = np.linspace(0, count, _MOST_POINTS // 2, endpoint=False).astype(int)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
-    ends = np.append(starts[1:], count) - 1
-    return np.stack([time[starts], time[ends]], axis=1).reshape(-1), np.stack([low, high], axis=1).reshape(
-        -1, values.shape[1]
-    )
+    return np.stack([time[starts], time[np.append(starts[1:], count) - 1]], axis=1).reshape(-1), np.stack(
+        [low, high], axis=1
+    ).reshape(-1, values.shape[1])
 
 
 def _traces(axes: Axes, signal: Signal, offset: float = 0.0, named: bool = True) -> None:
@@ -250,7 +262,7 @@ def residual_figure(errors: PoseAndTurnErrors) -> Figure:
     before, after = rms(errors.norm_before), rms(errors.norm_after)
     grid[0].stem(pose, errors.norm_before, linefmt=BEFORE, markerfmt="o", basefmt=" ")
     title = f"At rest the accelerometer missed gravity by {size(before, 'm/s^2')} (rms) before calibration …"
-    dressed(grid[0], title, ylabel="before (m/s²)")
+    dressed(grid[0], title, 0.0, ylabel="before (m/s²)")
 
     factor, unit = readable("m/s^2", after)
     edges = np.append(pose - 0.5, pose[-1] + 0.5).repeat(2)[1:-1]
@@ -259,9 +271,7 @@ def residual_figure(errors: PoseAndTurnErrors) -> Figure:
         grid[1].fill_between(edges, -half, half, color=color, alpha=0.7, linewidth=0, label=label)
     grid[1].plot(pose, factor * errors.norm_after, "o", color=AFTER, markeredgecolor="white", markersize=5.5)
     title = f"… and misses it by {size(after, 'm/s^2', 2)} after: {how_much_smaller(before, after)}"
-    dressed(grid[1], title, ylabel=f"after ({unit})")
-    for axes in grid[:2]:
-        zero_line(axes)
+    dressed(grid[1], title, 0.0, ylabel=f"after ({unit})")
 
     if rows == 3:
         axes = grid[2]
@@ -277,8 +287,7 @@ def residual_figure(errors: PoseAndTurnErrors) -> Figure:
         dressed(axes, f"Over a turn the gyroscope loses gravity's direction {lost}", ylabel="angle error (°)")
         legend(grid[1], 2)
     legend_below(figure, grid[-1], 4)
-    across = "pose" + (" (turns lie between two poses)" if rows == 3 else "")
-    grid[-1].set(xlabel=across, xlim=(0.4, len(pose) + 0.6))
+    grid[-1].set(xlabel="pose" + (" (turns lie between two poses)" if rows == 3 else ""), xlim=(0.4, len(pose) + 0.6))
     grid[-1].xaxis.get_major_locator().set_params(integer=True)
     return figure
 
@@ -342,8 +351,7 @@ def correlation_figure(calibration: Calibration) -> Figure:
 def _flat(directions: FloatArray) -> FloatArray:
     """Map a half sphere about ±z to a disc of radius one; equal areas stay equal (Lambert)."""
     across = lengths_of(directions[:, :2])
-    radius = root_or_zero(1 - np.abs(directions[:, 2]))
-    return directions[:, :2] * (radius / np.maximum(across, 1e-12))[:, None]
+    return directions[:, :2] * (root_or_zero(1 - np.abs(directions[:, 2])) / np.maximum(across, 1e-12))[:, None]
 
 
 def raised_to_sphere(x: FloatArray, y: FloatArray, sign: int) -> FloatArray:

@@ -15,7 +15,7 @@ from jaximu.model.effects.magnetic_field import SetupMagneticField
 from jaximu.report.attitude import mounting_words
 from jaximu.report.calibration import calibration_page
 from jaximu.report.canvas import Figure
-from jaximu.report.figures import AXES, band, dressed, legend, logarithmic, stacked, zero_line
+from jaximu.report.figures import AXES, band, dressed, legend, logarithmic, stacked
 from jaximu.report.vehicle import vehicle_page
 from jaximu.report.words import BEYOND, gravity_statements, limits
 
@@ -60,15 +60,14 @@ def statements(calibration: Calibration, history: History) -> Iterator[Statement
 
 def _convergence(history: History) -> str:
     """Say after how long each kind of number was known to twice its last uncertainty."""
-    parts = []
-    never = []
+    parts, never = [], []
     for owner, part, *_ in _PANELS:
         times = [history.converged(state) for state in _places(history, owner, part)]
         if times and None not in times:
             parts.append(f"{owner} {part} after {max(time for time in times if time is not None):.0f} s")
         elif times:
             never.append(f"{owner} {part}")
-    text = f"Known to twice the last uncertainty: {', '.join(parts)}." if parts else ""
+    text = f"Known to twice the last uncertainty: {', '.join(parts)}." * bool(parts)
     if never:
         text += f" Not every axis became twice as well known as it was at the start: {', '.join(never)}."
     return text.strip()
@@ -200,8 +199,7 @@ def _figure(calibration: Calibration, history: History) -> Figure:
         markersize=3,
     )
     logarithmic(innovations, "y")
-    zero_line(innovations, 1.0)
-    dressed(innovations, "Squared innovations over their expectation", xlabel="time [s]")
+    dressed(innovations, "Squared innovations over their expectation", 1.0, xlabel="time [s]")
     for panel in panels:
         panel.fill_between(
             time, 0, 1, where=history.rest, color="0.93", transform=panel.get_xaxis_transform(), step="pre", zorder=-1

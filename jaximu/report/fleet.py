@@ -34,6 +34,13 @@ def page_of(fleet: Fleet, magnetometers: Sequence[str] = ()) -> Page:
     """Return the population, outliers, what lots and dates change, what failed; `magnetometers`: sentences on these."""
     done = fleet.statuses["ok"]
     document = Path(fleet.table).with_suffix(".json").name
+    picture = Picture(
+        "population",
+        partial(population_figure, fleet),
+        "Units by parameter",
+        "Each dot is a unit, as estimated from its own recording; the bar is the mean of the fleet and two standard "
+        "deviations to each side, the noise of the estimates taken off. Orange: outliers.",
+    )
 
     def rest() -> Iterator[Part]:
         lots = [difference for difference in fleet.differences if difference.kind == "lot"]
@@ -54,7 +61,7 @@ def page_of(fleet: Fleet, magnetometers: Sequence[str] = ()) -> Page:
         f"{done} of {fleet.recordings}",
         "recordings calibrated",
         (
-            *_population(fleet),
+            *(() if fleet.population is None else (picture,)),
             _outliers(fleet, document),
             *_differences(fleet),
             _failures(fleet, document),
@@ -213,17 +220,6 @@ def _kind_of(name: Name) -> tuple[str, str, bool, str, str, float]:
 # --- the population ---------------------------------------------------------------------------------------------------
 
 
-def _population(fleet: Fleet) -> Iterator[Picture]:
-    if fleet.population is not None:
-        yield Picture(
-            "population",
-            partial(population_figure, fleet),
-            "Units by parameter",
-            "Each dot is a unit, as estimated from its own recording; the bar is the mean of the fleet and two "
-            "standard deviations to each side, the noise of the estimates taken off. Orange: outliers.",
-        )
-
-
 def _prior(fleet: Fleet) -> Iterator[Section]:
     if fleet.population is None:
         return
@@ -338,9 +334,8 @@ def prior_figure(fleet: Fleet) -> Figure:
     for axes, kind, columns in panels:
         for column, k in enumerate(columns):
             axes.plot(_beside(column, len(share)), share[:, k], ".", color=_PRIOR, alpha=0.5, ms=5, mew=0)
-        figures.zero_line(axes, 100.0)
         _axis_names(axes, population, columns)
-        dressed(axes, kind[3], ylabel="with prior / alone [%]", ylim=(0, 108))
+        dressed(axes, kind[3], 100.0, ylabel="with prior / alone [%]", ylim=(0, 108))
     return figure
 
 
@@ -357,8 +352,7 @@ def lot_figure(fleet: Fleet, difference: Difference) -> Figure:
     different = [difference.group for difference in fleet.differences if difference.kind == "lot"]
     if len(names) > 40:
         names = [*different[:10], *[lot for lot in names if lot not in different][:30]]
-    figure = figures.new_figure(3.2)
-    axes = figure.add_subplot()
+    figure, (axes,) = figures.beside(1, 3.2)
     for column, lot in enumerate(names):
         points = values[lots == lot]
         axes.plot(

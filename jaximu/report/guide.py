@@ -64,19 +64,14 @@ class LivePage:
     def parts(self) -> dict[str, str]:
         """Return what stands in each element of the page, as HTML."""
         capture = self.capture
-        moment = self.capture.moment
-        lasting = time.monotonic() - capture.since > _LASTING
-        texts = {
-            "headline": _headline(capture),
-            "news": capture.news,
-            "stage": capture.stage if lasting and not capture.end else "",
-        }
+        moment = capture.moment
+        lasting = time.monotonic() - capture.since > _LASTING and not capture.end
+        texts = {"headline": _headline(capture), "news": capture.news, "stage": capture.stage * lasting}
         parts = {name: str(escape(text)) for name, text in texts.items()}
         return parts if moment is None else parts | self._parts_of(moment, bool(capture.end or moment.done))
 
     def _parts_of(self, moment: Moment, over: bool) -> dict[str, str]:
-        rest = self.capture.rest
-        ups = moment.ups
+        rest, ups = self.capture.rest, moment.ups
         still = min(moment.still, rest)
         first = attitude_of(ups[0] if len(ups) else moment.held).as_quat(scalar_first=True)
         before = reduce(turned_to, ups[1:], first)  # from pose to pose by the shortest turn: its heading is not known
@@ -111,7 +106,7 @@ class LivePage:
 
     def _map(self, moment: Moment, over: bool) -> str:
         ups = moment.ups
-        names = [f"pose {index}" for index in range(1, len(moment.ups) + 1)]
+        names = [f"pose {index}" for index in range(1, len(ups) + 1)]
         colors = [_POSE] * len(names)
         if moment.up is not None and not over:
             ups, names, colors = np.vstack([ups, moment.up]), [*names, f"next: {moment.words}"], [*colors, _NEXT]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.acceptance.history import LimitReached, Movement, UnitHistory
-from jaximu.acceptance.words import between, in_shown_unit, spoken
+from jaximu.acceptance.words import in_shown_unit, spoken
 from jaximu.ground.distributions import student_isf
 from jaximu.ground.page import Page, Part, Picture, Statement, Table
 from jaximu.ground.quantities import Z95, counted, number, probability, sentence, size, with_interval
@@ -91,7 +91,7 @@ def _due(history: UnitHistory) -> str:
         return f"{sentence(spoken(first.name))} is already within the guard band of its limit: calibrate now."
     return (
         f"Calibrate again within {_duration(history, first.after)}: {spoken(first.name)} may then reach its limit, "
-        f"{between(first.limit.low, first.limit.high, first.limit.unit, first.limit.stated)}."
+        f"{first.limit.words()}."
     )
 
 
@@ -152,7 +152,7 @@ def _rest(history: UnitHistory) -> Iterator[Part]:
     if len(known) == len(history.files) and max(known) > min(known):
         yield Picture(
             "temperature",
-            partial(_temperature_figure, history),
+            lambda: _drawn(history, np.array(history.temperatures, float), "temperature [°C]")[0],
             "The numbers that changed most surely, over the temperatures of their recordings",
             "The same numbers over the temperature of their recordings: what follows it has not aged.",
         )
@@ -175,28 +175,24 @@ def _numbers_table(history: UnitHistory) -> Table:
     movements = sorted(
         history.movements, key=lambda movement: (not movement.moved, not movement.tested, movement.p_value)
     )
-    rows = []
-    for movement in movements:
-        p_value = (
-            probability(movement.adjusted).removeprefix("= ") if movement.tested else "differs after every power-on"
-        )
-        row = [
+    rows = [
+        [
             spoken(movement.name),
             _amount(movement, movement.values[0], movement.sigmas[0], False),
             _amount(movement, movement.difference, movement.sigma),
             f"{abs(movement.z):.1f}",
-            p_value,
+            probability(movement.adjusted).removeprefix("= ") if movement.tested else "differs after every power-on",
+            *[_drift(movement)] * over_time,
+            *[probability(movement.line.p_value).removeprefix("= ")] * straight,
         ]
-        row += [_drift(movement)] * over_time
-        rows.append(row + [probability(movement.line.p_value).removeprefix("= ")] * straight)
+        for movement in movements
+    ]
     caption = (
         f"p: of no change in all {len(history.files)} calibrations, with all numbers allowed for (Holm). Moved is "
         f"below {history.level / 2:g}: half the rate of false alarms, the other half is for all numbers together"
+        + ". Drift: of the line through all values, ± 95 %" * over_time
+        + "; p, straight: of scatter as large about it; below 0.05 the interval is widened by that scatter" * straight
     )
-    if over_time:
-        caption += ". Drift: of the line through all values, ± 95 %"
-    if straight:
-        caption += "; p, straight: of scatter as large about it; below 0.05 the interval is widened by that scatter"
     count = len(history.moved)
     return Table(tuple(headers), rows, f"{caption}.", range(count), brief=max(6, count))
 
@@ -222,14 +218,12 @@ def _limits_table(history: UnitHistory) -> Table:
 
     def row(reached: LimitReached) -> tuple[str, ...]:
         movement = movements[reached.name]
-        limit = reached.limit
-        after = "never, at this drift" if reached.after is None else _duration(history, reached.after)
         return (
             spoken(reached.name),
-            between(limit.low, limit.high, limit.unit, limit.stated),
+            reached.limit.words(),
             _amount(movement, movement.line.level, float(np.sqrt(movement.line.covariance[0, 0]))),
             f"{_drift(movement)}/{history.per}",
-            after,
+            "never, at this drift" if reached.after is None else _duration(history, reached.after),
         )
 
     ordered = sorted(history.limits, key=lambda limit: np.inf if limit.after is None else limit.after)
@@ -258,8 +252,7 @@ def _pictured_changes(history: UnitHistory) -> Picture:
 
 def _changes_figure(history: UnitHistory) -> Figure:
     rows = history.movements[::-1]
-    figure = figures.new_figure(1.0 + 0.17 * len(rows))
-    panel = figure.subplots(1, 1)
+    figure, (panel,) = figures.beside(1, 1.0 + 0.17 * len(rows))
     panel.axvspan(-Z95, Z95, color="#E6E6E6", linewidth=0)
     for row, movement in enumerate(rows):
         colour = figures.FLAGGED if movement.moved else figures.AFTER if movement.tested else figures.BEFORE
@@ -306,7 +299,3 @@ def _history_figure(history: UnitHistory) -> Figure:
         days = (history.times[-1] - ahead) / np.ptp(history.times) * (at[-1] - at[0])
         figures.band(panel, at[-1] - days, factor * level, factor * half, figures.AFTER)
     return figure
-
-
-def _temperature_figure(history: UnitHistory) -> Figure:
-    return _drawn(history, np.array(history.temperatures, float), "temperature [°C]")[0]

@@ -11,7 +11,7 @@ from jaximu.acceptance.decision import FAIL, PASS
 from jaximu.acceptance.limits import Limit
 from jaximu.acceptance.line import FollowedQuantity, Line
 from jaximu.acceptance.statistics import Chart
-from jaximu.acceptance.words import amount, between, in_shown_unit, si_unit, spoken
+from jaximu.acceptance.words import amount, in_shown_unit, si_unit, spoken
 from jaximu.ground.page import Page, Picture, Section, Table
 from jaximu.ground.quantities import Z95, counted, number, sentence, with_interval
 from jaximu.report import figures
@@ -107,11 +107,9 @@ def _verdict(line: Line, able: _WithCpk) -> Iterator[str]:
 def _why_not_capable(quantity: FollowedQuantity) -> str:
     capability, limit, unit = quantity.capability, quantity.limit, si_unit(quantity.name)
     assert capability is not None and limit is not None
-    limits = between(limit.low, limit.high, unit, limit.stated)
-    if capability.cp[0] < _CAPABLE:
-        why = f"varies too much for the limits {limits}"
-    else:
-        why = f"has a mean, {amount(capability.mean, unit, 3, limit.stated)}, too near a limit ({limits})"
+    why = f"varies too much for the limits {limit.words()}"
+    if not capability.cp[0] < _CAPABLE:  # or there is one limit only
+        why = f"has a mean, {amount(capability.mean, unit, 3, limit.stated)}, too near a limit ({limit.words()})"
     verb = "is not" if capability.cpk[2] < _CAPABLE else "may not be"  # by the interval's upper end
     return f"The line {verb} capable: {spoken(quantity.name)} {why}."
 
@@ -158,7 +156,7 @@ def _capability_row(quantity: FollowedQuantity, failed: int) -> tuple[str, ...]:
         _index(capability.cpk),
         _index(capability.cp),
         with_interval(factor * capability.mean, factor * capability.deviation / Z95, shown),  # ± one deviation
-        between(limit.low, limit.high, unit, limit.stated),
+        limit.words(),
         str(failed),
     )
 
@@ -207,8 +205,7 @@ def _gauge(line: Line) -> Section:
             continue
         shown, factor = in_shown_unit(unit, stated)
         value, low, high = (number(factor * end, 2) for end in gauge.repeatability)
-        if gauge.categories < _CATEGORIES:
-            marked.append(len(rows))
+        marked += [len(rows)] * (gauge.categories < _CATEGORIES)
         rows.append(
             (
                 spoken(quantity.name),
@@ -216,7 +213,7 @@ def _gauge(line: Line) -> Section:
                 amount(gauge.reproducibility, unit, 2, stated) if gauge.crossed else "not crossed",
                 amount(gauge.parts, unit, 2, stated),
                 str(gauge.categories),
-                f"{gauge.explained:.2f}{' *' if gauge.p_value * questions < _LEVEL else ''}",
+                f"{gauge.explained:.2f}{' *' * (gauge.p_value * questions < _LEVEL)}",
             )
         )
     return Section(
@@ -300,4 +297,4 @@ def _draw_limits(axes: Axes, limit: Limit | None, chart: Chart, factor: float) -
     ends = [end for end in (limit.low, limit.high) if abs(end - chart.centre) < farthest]
     for end in ends:
         axes.axhline(factor * end, color="black", linewidth=1.4, label="limit" if end == ends[0] else None)
-    return f", limits {between(limit.low, limit.high, limit.unit, limit.stated)}" + ("" if ends else " (off the panel)")
+    return f", limits {limit.words()}" + ("" if ends else " (off the panel)")

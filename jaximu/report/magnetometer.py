@@ -16,7 +16,7 @@ from jaximu.ground.page import Page, Picture, Statement
 from jaximu.ground.quantities import Z95, number, sentence
 from jaximu.report.calibration import calibration_page
 from jaximu.report.canvas import Figure
-from jaximu.report.figures import dressed, hemispheres, legend, new_figure
+from jaximu.report.figures import dressed, hemispheres, new_figure
 
 _PAYS = 0.8
 """Share of what is uncertain of a heading that must be left for further directions to be worth a turn."""
@@ -63,22 +63,20 @@ def statements(calibration: Calibration) -> Iterator[Statement]:
     if dip is not None:
         way = "below" if dip["value"] > 0 else "above"
         text += f", pointing {number(abs(dip['value']), 3)} ± {number(Z95 * dip['sigma'], 2)}° {way} the level"
-    known = " (95 %)"
+    text += " (95 %)"
     if strength["sigma"] > 0.01 * strength["value"]:
-        known += "; every gain shares the uncertainty of the strength, which --field or --longitude would narrow"
-    yield from [
-        Statement("The field", f"{text}{known}."),
-        Statement(
-            "Hard iron",
-            f"{number(iron, 3)} ± {number(Z95 * sigma, 2)} µT (95 %), {number(100 * iron / strength['value'], 2)} % of "
-            "the field.",
-        ),
-        Statement(
-            "Soft iron and scale",
-            f"The output changes {number(100 * (axes[0] / axes[-1] - 1), 2)} % more with a field along one direction "
-            "than along another.",
-        ),
-    ]
+        text += "; every gain shares the uncertainty of the strength, which --field or --longitude would narrow"
+    yield Statement("The field", f"{text}.")
+    yield Statement(
+        "Hard iron",
+        f"{number(iron, 3)} ± {number(Z95 * sigma, 2)} µT (95 %), {number(100 * iron / strength['value'], 2)} % of the "
+        "field.",
+    )
+    yield Statement(
+        "Soft iron and scale",
+        f"The output changes {number(100 * (axes[0] / axes[-1] - 1), 2)} % more with a field along one direction than "
+        "along another.",
+    )
     share = facts["coverage"]
     words = "all round" if share > 0.9 else "from most directions" if share > _ENOUGH else "from some directions only"
     yield Statement(
@@ -86,10 +84,9 @@ def statements(calibration: Calibration) -> Iterator[Statement]:
         f"The field was seen {words}: {100 * share:.0f} % of the sphere lies within 15° of a measured direction.",
         share < _ENOUGH,
     )
-    if facts.get("next") is not None:
-        yield Statement("Next", sentence(next_words(facts["next"])))
-    if facts["heading_error"] is not None:
-        worst = facts["heading_error"]
+    if (plan := facts.get("next")) is not None:
+        yield Statement("Next", sentence(next_words(plan)))
+    if (worst := facts["heading_error"]) is not None:
         yield Statement(
             "Heading in other attitudes",
             f"Rolled or pitched by 45°, or upside down, it is good to {number(worst['worst'], 2)}° at the worst "
@@ -144,9 +141,8 @@ def _figure(calibration: Calibration, measurement: MagneticField, heading: Headi
     field = windows.field(calibration.imu)[windows.used]
     length = np.linalg.norm(field, axis=1)
     off = 100 * (length / measurement.strength - 1)
-    span = 0.98
     figure = new_figure(3.6)
-    limit = np.quantile(np.abs(off), span)
+    limit = np.quantile(np.abs(off), 0.98)
     panels, grid = hemispheres(
         figure,
         2 if heading is None else 3,
@@ -170,8 +166,7 @@ def _figure(calibration: Calibration, measurement: MagneticField, heading: Headi
         names = ["level", "rolled 45°", "rolled −45°", "pitched 45°", "pitched −45°", "upside down"]
         for row, name in zip(np.hypot(heading.sigma, heading.scatter), names, strict=True):
             axes.plot(turned, np.append(row, row[0]), label=name, linewidth=2.2 if name == "level" else 1.0)
-        dressed(axes)
-        axes.set(title="heading good to [°]", xlabel="heading [°]", ylim=(0, None))
+        dressed(axes, key=1, xlabel="heading [°]", ylim=(0, None))
+        axes.set_title("heading good to [°]")
         axes.set_xticks([0, 90, 180, 270, 360], ["N", "E", "S", "W", "N"])
-        legend(axes)
     return figure

@@ -112,16 +112,14 @@ def _instructions(proposal: Proposal) -> Iterator[str]:
 
 def _next(proposal: Proposal) -> str:
     equipment = proposal.equipment
+    command, earlier = "turntable LOG --reference schedule.csv", ""
     if equipment.by_hand:
-        command = "jaximu calibrate LOG -o RESULTS"
+        command, earlier = "calibrate LOG", " with earlier recordings beside LOG"
     elif equipment.accuracy is not None:
-        command = "jaximu reference LOG --reference REF -o RESULTS"
+        command = "reference LOG --reference REF"
     elif equipment.in_sequence:
-        command = "jaximu filter LOG -o RESULTS"
-    else:
-        command = "jaximu turntable LOG --reference schedule.csv -o RESULTS"
-    earlier = " with earlier recordings beside LOG" * equipment.by_hand
-    return f"record the poses, then run `{command}`{earlier}."
+        command = "filter LOG"
+    return f"record the poses, then run `jaximu {command} -o RESULTS`{earlier}."
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------

@@ -235,15 +235,17 @@ def provenance(calibration: Calibration) -> list[tuple[str, str]]:
         for name, key in (("accelerometer", "rate"), ("gyroscope", "gyroscope_rate"))
         if key in data
     ]
-    poses = [
-        f"{len(part.intervals)}; still is a variance up to {part.threshold:g} times the noise floor (intervals at "
-        f"each threshold tried: {part.table()})"
-        for part in calibration.segmentations
-    ]
     return [
-        *([("Sample rate", ", ".join(rates))] if rates else []),
+        *[("Sample rate", ", ".join(rates))] * bool(rates),
         ("Used", f"{data.get('poses', 0)} poses at rest, {data.get('turns', 0)} turns between them"),
-        *(("Poses found", text) for text in poses),
+        *(
+            (
+                "Poses found",
+                f"{len(part.intervals)}; still is a variance up to {part.threshold:g} times the noise floor (intervals "
+                f"at each threshold tried: {part.table()})",
+            )
+            for part in calibration.segmentations
+        ),
         ("Gravity", f"{gravity.value:.7g} m/s², standard deviation {gravity.sigma:g} m/s²"),
         ("Method", _METHODS.get(calibration.method, calibration.method)),
         ("Loss", "least squares" if calibration.loss == "linear" else f"robust ({calibration.loss})"),

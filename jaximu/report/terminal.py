@@ -92,8 +92,7 @@ def _print_grid(table: Table, words: Sequence[int], widths: list[int], screen: C
     """Print a table whose columns are as wide as stated, or narrower where that is more than there is room for."""
     room = screen.width - 2 * len(widths)
     while sum(widths) > room:
-        widest = max(range(len(widths)), key=lambda at: widths[at] - words[at])
-        widths[widest] -= 1
+        widths[max(range(len(widths)), key=lambda at: widths[at] - words[at])] -= 1
     grid = Grid(box=box.SIMPLE_HEAD if any(table.headers) else None, padding=(0, 1, 0, 0), show_edge=False)
     for index, width in enumerate(widths):
         grid.add_column(table.headers[index] if table.headers else "", width=width, overflow="fold")

@@ -26,7 +26,7 @@ from jaximu.planning.ramps import next_ramps
 from jaximu.recordings.recording import Recording, smoothed_slope
 from jaximu.report.canvas import Figure
 from jaximu.report.export.thermal_autopilot import AutopilotParameters
-from jaximu.report.figures import dressed, legend, new_figure, zero_line
+from jaximu.report.figures import beside, dressed, legend, new_figure
 from jaximu.report.words import compensation, file_names, how_much_smaller
 
 _ROWS = 45  # three to a term of a regression
@@ -86,12 +86,10 @@ def _verdict(thermal: ThermalCalibration) -> Iterator[str]:
     jumps = ", jumps included" * bool(thermal.jumps)
     span = "{:.0f} and {:.0f} °C".format(*thermal.blocks.range).replace("-", "−")
     for name, fit in thermal.fits.items():
-        moves = f"{_size(name, fit.before)} (rms) between {span}"
+        after = "no model of temperature improves it"
         if fit.candidate.names:
             after = f"with the model {_size(name, fit.after)} remain{jumps}"
-            yield f"The {name}'s output at rest moves by {moves}; {after}."
-        else:
-            yield f"The {name}'s output at rest moves by {moves}; no model of temperature improves it."
+        yield f"The {name}'s output at rest moves by {_size(name, fit.before)} (rms) between {span}; {after}."
     if all(part.apart < ENOUGH for part in thermal.identifiability.parts.values()):
         yield (
             "The recordings cannot separate temperature from its rate: use the calibration only where the temperature "
@@ -143,10 +141,9 @@ def _model(thermal: ThermalCalibration, name: str) -> Statement:
     effects = [effect_title(f"{PREFIXES[name]}.{effect}") for effect in fit.candidate.names]
     before, after = (_size(name, held.rms) for held in (fit.held_before, fit.candidate.held))
     apart = " (jumps apart)" * bool(thermal.jumps)
+    text = f"No effect of temperature improves the prediction of {_parts(thermal)} left out: {after} remain{apart}."
     if effects:
         text = f"With {listed(effects)}, {after} remain on {_parts(thermal)} left out{apart}, {before} without a model."
-    else:
-        text = f"No effect of temperature improves the prediction of {_parts(thermal)} left out: {after} remain{apart}."
     return Statement(f"Model of the {name}", text)
 
 
@@ -436,15 +433,15 @@ def band_figure(thermal: ThermalCalibration, name: str) -> Figure:
     value, sigma = thermal.bias(name, temperature)
     data = bias_dots(thermal, name)
     parts = _both_ways(thermal)
-    figure = new_figure(3.4)
-    for axis, panel in enumerate(figure.subplots(1, 3)):
+    figure, panels = beside(3, 3.4)
+    for axis, panel in enumerate(panels):
         for part, style in parts:
             panel.plot(thermal.blocks.temperature[part], factor * data[part, axis], ".", ms=2.5, **style)
         low, high = (factor * (value + sign * Z95 * sigma)[:, axis] for sign in (-1, 1))
         panel.fill_between(temperature, low, high, color="0.5", alpha=0.35, linewidth=0)
         panel.plot(temperature, factor * value[:, axis], color="black", lw=1.1, label="steady, with 95 % band")
         dressed(panel, f"{sentence(name)} {'xyz'[axis]} [{unit}]", xlabel="temperature [°C]")
-    legend(figure.axes[0])
+    legend(panels[0])
     return figure
 
 
@@ -460,8 +457,7 @@ def residual_figure(thermal: ThermalCalibration, name: str) -> Figure:
         for panel, x in zip(row, (blocks.temperature, blocks.time / 3600), strict=True):
             for part, style in parts:
                 panel.plot(x[part], values[part], ".", ms=3, **style)
-            zero_line(panel)
-            dressed(panel)
+            dressed(panel, level=0.0)
         row[0].set_ylabel(f"{name} {axis} [{unit}]", fontsize=9)
     dressed(grid[0, 0], "Residual bias by temperature")
     dressed(grid[0, 1], "by time")
@@ -474,13 +470,17 @@ def residual_figure(thermal: ThermalCalibration, name: str) -> Figure:
 def covered_figure(thermal: ThermalCalibration) -> Figure:
     """Draw the temperatures and rates that the recordings went through."""
     blocks = thermal.blocks
-    figure = new_figure(3.4)
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = beside(2, 3.4)
     for part, style in _both_ways(thermal):
         left.plot(blocks.temperature[part], 60 * blocks.rate[part], ".", ms=4, **style)
         right.plot(blocks.time[part] / 3600, blocks.temperature[part], ".", ms=3, **style)
-    zero_line(left)
-    legend(left)
-    dressed(left, "Temperatures and rates covered", xlabel="temperature [°C]", ylabel="rate of temperature [K/min]")
+    dressed(
+        left,
+        "Temperatures and rates covered",
+        0.0,
+        1,
+        xlabel="temperature [°C]",
+        ylabel="rate of temperature [K/min]",
+    )
     dressed(right, "Over time", xlabel="time [h]", ylabel="temperature [°C]")
     return figure

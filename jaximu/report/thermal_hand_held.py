@@ -16,7 +16,7 @@ from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE
 from jaximu.report.canvas import Figure
-from jaximu.report.figures import AFTER, AXES, BEFORE, band, dressed, legend, legend_below, new_figure, zero_line
+from jaximu.report.figures import AFTER, AXES, BEFORE, band, beside, dressed, legend, legend_below, new_figure
 from jaximu.report.thermal import effect_table, files_and_next
 from jaximu.report.words import how_much_smaller
 
@@ -88,7 +88,7 @@ def _first(thermal: HandHeldThermal) -> Iterator[Part]:
         yield Section("Effects", [effect_table(thermal.calibration)])
     limits = Table(
         ("effect", "size that could hide", "at the end of the range"),
-        _limit_rows(thermal),
+        [*_limit_rows(thermal)],
         "Effects that were tested and are not needed. Larger ones would have been found nine times in ten.",
     )
     undetermined = [
@@ -102,20 +102,18 @@ def _first(thermal: HandHeldThermal) -> Iterator[Part]:
     yield Section("What may still hide", [limits, *undetermined, untested])
 
 
-def _limit_rows(thermal: HandHeldThermal) -> list[tuple[str, ...]]:
-    """Return by effect that was not taken in: its detection limit, and what that is at the end of the range.
+def _limit_rows(thermal: HandHeldThermal) -> Iterator[tuple[str, ...]]:
+    """Yield by effect that was not taken in: its detection limit, and what that is at the end of the range.
 
     Of a scale or a misalignment in percent.
     """
-    rows = []
     extent = max(abs(end - thermal.calibration.imu.accelerometer.temperature_reference) for end in thermal.range)
     for name, (value, unit) in thermal.limits.items():
         kind = CATALOGUE[name]
         scale = float(np.mean(thermal.calibration.triads()[kind.owner].scales))
         most = value * extent ** _POWER.get(kind.plain, 1) / scale
         shown = size(most, SENSOR_UNITS[kind.owner], 2) if kind.plain in POWERS else size(100 * most, "%", 2)
-        rows.append((kind.title, size(value, unit, 2), shown))
-    return rows
+        yield kind.title, size(value, unit, 2), shown
 
 
 def _changed(thermal: HandHeldThermal) -> list[tuple[str, str, tuple[str, ...], float]]:
@@ -146,8 +144,7 @@ def _change_figure(thermal: HandHeldThermal) -> Figure:
     for panel, (title, value, sigma) in zip(panels, drawn, strict=False):
         for axis, (name, colour) in enumerate(AXES.items()):
             band(panel, temperature, value[:, axis], Z95 * sigma[:, axis], colour, label=name)
-        zero_line(panel)
-        dressed(panel, title, xlabel="temperature [°C]")
+        dressed(panel, title, 0.0, xlabel="temperature [°C]")
     legend(panels[0], 3)
     return figure
 
@@ -160,16 +157,14 @@ def _error_figure(thermal: HandHeldThermal) -> Figure:
     temperature = (temperature[real.first] + temperature[real.last]) / 2
     series = [("one bias and scale for all temperatures", BEFORE, thermal.base)]
     series += [("with the effects", AFTER, thermal.state)] if thermal.steps else []
-    figure = new_figure(3.6)
-    panels = figure.subplots(1, len(real.kinds))
+    figure, panels = beside(len(real.kinds), 3.6)
     for index, (panel, kind) in enumerate(zip(panels, real.kinds, strict=True)):
         errors = [np.abs(thermal.experiment.errors(state)[index]).max() for _, _, state in series]
         factor, unit = readable(kind.unit, max(errors))
         warmth = temperature[real.kind == index][:: kind.components]
         for label, colour, state in series:
             panel.plot(warmth, factor * thermal.experiment.errors(state)[index], ".", ms=5, color=colour, label=label)
-        zero_line(panel)
-        dressed(panel, xlabel="temperature [°C]")
+        dressed(panel, level=0.0, xlabel="temperature [°C]")
         panel.set_title(f"{sentence(kind.words)} [{unit}]", loc="left", fontsize=9, fontweight="bold")
     legend_below(figure, panels[0], 2)
     return figure

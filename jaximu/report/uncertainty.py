@@ -163,8 +163,7 @@ def _turning(calibration: Calibration, extent: Range) -> str:
 
 def _panels(calibration: Calibration, extent: Range) -> Iterator[tuple[str, str, str, dict[str, FloatArray], Any]]:
     """Return title, words of both axes, lines by name and their heights (lines, n) of each panel."""
-    triads = calibration.triads()
-    if "gyroscope" in triads:
+    if "gyroscope" in calibration.triads():
         rates = np.linspace(0.0, np.degrees(extent.rate), _STEPS)
         both = np.radians(rates)[:, None, None] * _FACES
         half = _rate_known(calibration, extent, both.reshape(-1, 3)).reshape(-1, 2, 3)
@@ -281,7 +280,5 @@ def sphere_figure(
     bar = figure.colorbar(ScalarMappable(norm, colormap), cax=figure.add_subplot(grid[1, :2]), orientation="horizontal")
     bar.set_label(f"specific force at rest, ± 95 % ({unit})", fontsize=10)
     what = called if np.isfinite(half[at]) else "Not determined"
-    figure.suptitle(
-        f"{what} with the direction {direction_words(points[at])} up", x=0.01, ha="left", fontsize=12, fontweight="bold"
-    )
+    figures.headed(figure, f"{what} with the direction {direction_words(points[at])} up")
     return figure

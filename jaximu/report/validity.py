@@ -16,7 +16,6 @@ from jaximu.ground.quantities import change, listed, number, probability, senten
 from jaximu.mistakes.titles import effect_title
 from jaximu.report import figures
 from jaximu.report.canvas import Figure
-from jaximu.report.figures import legend, zero_line
 from jaximu.report.tables import short_name
 
 _OUTPUTS = {
@@ -94,9 +93,7 @@ def _statements(validity: Validity) -> Iterator[Statement]:
     for cause in validity.causes:
         text = f"{cause.sentence}, p {probability(cause.p_value)}."
         if cause.rivals:
-            text += (
-                f" This recording cannot distinguish it from {listed([effect_title(name) for name in cause.rivals])}."
-            )
+            text += f" This recording cannot distinguish it from {listed([*map(effect_title, cause.rivals)])}."
         yield Statement("What explains the difference", text)
     errors = [
         f"{_OUTPUTS[name]} {with_interval(error.value, error.sigma, error.unit)}"
@@ -145,10 +142,8 @@ def _drawn(shift: Shift) -> bool:
 
 def _shifts_figure(validity: Validity) -> Figure:
     """Gain and bias of both triads, in mm/s² and mrad/s."""
-    figure = figures.new_figure(3.9)
-    for panel, triad, unit in zip(
-        figure.subplots(1, 2), ("accelerometer", "gyroscope"), ("mm/s²", "mrad/s"), strict=True
-    ):
+    figure, panels = figures.beside(2, 3.9)
+    for panel, triad, unit in zip(panels, ("accelerometer", "gyroscope"), ("mm/s²", "mrad/s"), strict=True):
         shown = [shift for shift in validity.shifts if shift.parameter.owner == triad and _drawn(shift)][::-1]
         for row, shift in enumerate(shown):
             assert shift.in_si is not None and shift.sigma_in_si is not None
@@ -167,8 +162,7 @@ def _shifts_figure(validity: Validity) -> Figure:
 
 
 def _errors(validity: Validity, experiment: Experiment) -> Figure:
-    figure = figures.new_figure(3.4)
-    panels = figure.subplots(1, 2)
+    figure, panels = figures.beside(2, 3.4)
     real = experiment.real
     norms = real.of_kind("gravity_norm")
     turns = real.of_kind("gravity_direction")
@@ -182,22 +176,18 @@ def _errors(validity: Validity, experiment: Experiment) -> Figure:
             panel.plot(time, values, "o", color=colour, markersize=4, label=label)
     titles = ("gravity norm at rest", "gravity carried over a turn")
     for panel, title, unit in zip(panels, titles, ("mm/s²", "°"), strict=True):
-        zero_line(panel)
-        figures.dressed(panel, title, xlabel="time [s]", ylabel=f"error [{unit}]")
-        legend(panel)
+        figures.dressed(panel, title, 0.0, 1, xlabel="time [s]", ylabel=f"error [{unit}]")
     return figure
 
 
 def _innovations(validity: Validity) -> Figure:
     history = validity.history
     assert history is not None
-    figure = figures.new_figure(3.0)
-    panel = figure.subplots(1, 1)
+    figure, (panel,) = figures.beside(1, 3.0)
     used = history.freedom > 0
     panel.plot(
         history.time[used], history.innovations[used] / history.freedom[used], "o", color=figures.FLAGGED, markersize=4
     )
-    zero_line(panel, 1.0)
+    figures.dressed(panel, "innovations", 1.0, xlabel="time [s]", ylabel="squared, over expected")
     figures.logarithmic(panel, "y")
-    figures.dressed(panel, "innovations", xlabel="time [s]", ylabel="squared, over expected")
     return figure

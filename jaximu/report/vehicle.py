@@ -13,7 +13,7 @@ from jaximu.ground.quantities import Z95, counted, listed, size, with_interval, 
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.report.calibration import calibration_page
 from jaximu.report.canvas import Figure
-from jaximu.report.figures import AXES, band, dressed, legend, stacked, zero_line
+from jaximu.report.figures import AXES, band, dressed, legend, stacked
 from jaximu.report.words import compensation, limits
 
 _SURE = 4.0
@@ -122,17 +122,15 @@ def _figure(calibration: Calibration, vehicle: Mapping[str, Any], history: Histo
         band(bias, history.time, values - values[-1], Z95 * sigmas, color, label=axis)
     limit = 3 * np.degrees(Z95 * np.max(history.sigmas[len(history.time) // 2 :] / scale))
     bias.set_ylim(-limit, limit)
-    dressed(bias, "Gyroscope bias less its last value [°/s]")
+    dressed(bias, "Gyroscope bias less its last value [°/s]", 0.0)
     tilts = np.degrees([stop["tilt"] for stop in vehicle["stops"]])
     middle = [(stop["start"] + stop["stop"]) / 2 for stop in vehicle["stops"]]
     for column, name in enumerate(("forward", "to the left")):
         tilt.plot(middle, tilts[:, column], "o", label=name, markersize=4)
-    dressed(tilt, "Tilt at each stop less the mean: lean of the vertical [°]", xlabel="time [s]")
+    dressed(tilt, "Tilt at each stop less the mean: lean of the vertical [°]", 0.0, xlabel="time [s]")
     speeds = np.array([[entry["along"], entry["left"]] for entry in vehicle["speeds"]]).reshape(-1, 2)
     speed.plot(*speeds.T, "o", markersize=4)
-    dressed(speed, "Speeds beside stops", xlabel="along the vehicle [m/s]", ylabel="to its left [m/s]")
+    dressed(speed, "Speeds beside stops", 0.0, xlabel="along the vehicle [m/s]", ylabel="to its left [m/s]")
     legend(bias, 3, "upper right")
     legend(tilt, 2, "upper right")
-    for panel in (bias, tilt, speed):
-        zero_line(panel)
     return figure

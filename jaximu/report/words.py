@@ -112,12 +112,11 @@ def scatter_statements(calibration: Calibration) -> list[Statement]:
         times = np.sqrt(1 + excess)
         large = times >= BEYOND
         how = "as much as" if times < 1.1 else f"{times:.1f} times as much as"
+        why = "there is a little more than noise, and the intervals include it."
         if large:
             why = f"something beyond noise is there, {causes}."
         elif chi2_sf(times**2 * freedom[name], freedom[name]) > _CHANCE:
             why = "noise explains what the model leaves."
-        else:
-            why = "there is a little more than noise, and the intervals include it."
         entries.append(Statement(about, f"{sentence(subject)} scatter {how} their measured noise: {why}", large))
     if any(entry.caution for entry in entries):
         entries.append(

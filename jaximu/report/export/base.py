@@ -271,5 +271,4 @@ def comments(parameters: ExportedUnit, sign: str = "#") -> str:
     """Where the numbers come from and what axes they are for, for the head of a file."""
     calibration = parameters.calibration
     safe = "".join(letter if letter.isprintable() else "?" for letter in ", ".join(calibration.files) or "a recording")
-    version = calibration.software.get("version", "")
-    return f"{sign} Calibrated by jaximu {version} from {safe}. {parameters.axes}"
+    return f"{sign} Calibrated by jaximu {calibration.software.get('version', '')} from {safe}. {parameters.axes}"

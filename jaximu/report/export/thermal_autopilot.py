@@ -11,6 +11,7 @@ temperature, a lag, a hysteresis or a scale over temperature.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -178,21 +179,20 @@ class _Targets:
         reading = self.calibration.reading
         return cubic if reading is None else cubic @ reading.autopilot_maps[name]
 
-    def notes(self) -> list[str]:
+    def notes(self) -> Iterator[str]:
         """Say what a cubic of temperature cannot hold."""
         effects = [effect for triad in self.calibration.triads().values() for effect in triad.effects]
-        texts = []
         lost = [effect.name for effect in effects if effect.plain in (*RATES, SCALE, NETWORK)]
         lagging = [effect.name for effect in effects if memories([effect.plain])]
         if lost:
-            texts.append(f"a cubic of temperature cannot hold {', '.join(lost)}: left out.")
+            yield f"a cubic of temperature cannot hold {', '.join(lost)}: left out."
         if lagging:
-            texts.append(f"a cubic of temperature has no memory: {', '.join(lagging)} taken as if at once.")
-        if self.calibration.reading is None:
-            axes = "axes and units are those of the recording: it must be the autopilot's own log, in its axes."
-        else:
-            axes = "axes are the autopilot's own: forward, right, down; units must be those of its log."
-        return [*texts, axes]
+            yield f"a cubic of temperature has no memory: {', '.join(lagging)} taken as if at once."
+        yield (
+            "axes and units are those of the recording: it must be the autopilot's own log, in its axes."
+            if self.calibration.reading is None
+            else "axes are the autopilot's own: forward, right, down; units must be those of its log."
+        )
 
     def parameters(
         self, name: str, parameters: dict[str, float], lines: list[str], notes: list[str]
