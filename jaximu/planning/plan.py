@@ -357,7 +357,8 @@ def propose(
     exact, design, best, classical = _searched(question, poses, turns, equipment, seed, report)
     if classical:
         notes += ("well known positions do as well as any here, and are proposed.",)
-    names, size = question.parameters.names, question.parameters.size
+    names = question.parameters.names
+    size = question.parameters.size
     prior = np.linalg.inv(question.prior) + np.outer(question.by_gravity, question.by_gravity)
     # what the data sheet adds is none of the data's: it must not hide a direction that no pose tells
     root = root_of(best.information + question.prior - np.eye(len(size)) / TOLERANCE**2)
@@ -465,7 +466,8 @@ def _coarsened(question: DesignQuestion) -> DesignQuestion:
 
 def _plannable(imu: Imu) -> tuple[Imu, tuple[str, ...]]:
     """The unit with its effects dormant, but for those that poses and turns do not excite or that do not last."""
-    dormant, notes = [], []
+    dormant = []
+    notes = []
     for effect in (effect for triad in imu.triads().values() for effect in triad.effects):
         if effect.scope == "device" and set(effect.needs) <= set(STIMULI) and not effect.memory:
             dormant.append(CATALOGUE[effect.name].dormant(**{key: getattr(effect, key) for key in effect.inner}))
@@ -479,7 +481,8 @@ def _in_output(triad: Triad, density: FloatArray) -> FloatArray:
 
 
 def _accuracy(known: Known, imu: Imu, equipment: Equipment) -> tuple[Accuracy, tuple[str, ...]]:
-    notes, densities = [], []
+    notes = []
+    densities = []
     figures = {
         "accelerometer": (ACCELEROMETER_DENSITY, "100 µg/√Hz", known.accelerometer_noise),
         "gyroscope": (GYROSCOPE_DENSITY, "0.005 °/s/√Hz", known.gyroscope_noise),
@@ -501,7 +504,8 @@ def _accuracy(known: Known, imu: Imu, equipment: Equipment) -> tuple[Accuracy, t
 
 def _prior(known: Known, imu: Imu, parameters: Parameters, by_gravity: FloatArray) -> FloatArray:
     """Information (typical sizes) about the parameters, gravity known: the calibration's, else the data sheet's."""
-    names, size = parameters.names, parameters.size
+    names = parameters.names
+    size = parameters.size
     total = TOLERANCE**2 * np.eye(len(names))
     if known.covariance is not None:
         upper = [index for index, name in enumerate(names) if name in _UPPER]

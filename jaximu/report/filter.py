@@ -60,7 +60,8 @@ def statements(calibration: Calibration, history: History) -> Iterator[Statement
 
 def _convergence(history: History) -> str:
     """Say after how long each kind of number was known to twice its last uncertainty."""
-    parts, never = [], []
+    parts = []
+    never = []
     for owner, part, *_ in _PANELS:
         times = [history.converged(state) for state in _places(history, owner, part)]
         if times and None not in times:

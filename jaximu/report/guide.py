@@ -71,7 +71,8 @@ class LivePage:
         return parts if moment is None else parts | self._parts_of(moment, bool(capture.end or moment.done))
 
     def _parts_of(self, moment: Moment, over: bool) -> dict[str, str]:
-        rest, ups = self.capture.rest, moment.ups
+        rest = self.capture.rest
+        ups = moment.ups
         still = min(moment.still, rest)
         first = attitude_of(ups[0] if len(ups) else moment.held).as_quat(scalar_first=True)
         before = reduce(turned_to, ups[1:], first)  # from pose to pose by the shortest turn: its heading is not known

@@ -210,7 +210,7 @@ def _loss(what: str, errors: dict[str, FloatArray]) -> Loss:
 
 def _uncertainty(calibration: Calibration, extent: Range) -> Loss:
     """The standard deviation of corrected values (the length of their vector) over the range."""
-    still, moving = (calibration.uncertainty_of(path) for path in extent.paths())
+    still, moving = map(calibration.uncertainty_of, extent.paths())
     return _loss(
         "the uncertainty (1 sigma of corrected values; not an error of the file)",
         {name: np.stack([uncertainty.sigma, moving[name].sigma]) for name, uncertainty in still.items()},

@@ -71,8 +71,9 @@ def write(parameters: ExportedUnit) -> Written:
 def noise_lines(parameters: ExportedUnit, indent: str) -> list[str]:
     """The four densities and the rate as YAML; a number that is not known is a comment, never made up."""
     rate = parameters.noise.get("update_rate", parameters.calibration.data.get("rate"))
-    lines = []
-    for key, unit in KALIBR_UNITS.items():
-        value = parameters.noise.get(key)
-        lines.append(f"{indent}# {key}: not known [{unit}]" if value is None else f"{indent}{key}: {value:.9e}")
-    return [*lines, *([] if rate is None else [f"{indent}update_rate: {float(rate)!r}"])]
+    known = parameters.noise
+    lines = [
+        f"{indent}{key}: {known[key]:.9e}" if key in known else f"{indent}# {key}: not known [{unit}]"
+        for key, unit in KALIBR_UNITS.items()
+    ]
+    return lines if rate is None else [*lines, f"{indent}update_rate: {float(rate)!r}"]

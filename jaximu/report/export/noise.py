@@ -159,8 +159,7 @@ def noise_values(name: str, densities: Mapping[str, float], rate: float | None) 
     made = TARGETS[name]
     missing = [key.density for key in made.keys if not densities.get(key.density, 0.0) > 0]
     step = made.rate or rate
-    if any(key.power for key in made.keys) and not step:
-        missing.append("the rate")
+    missing += ["the rate"] * (any(key.power for key in made.keys) and not step)
     if missing:
         raise NotPossibleError(
             f"{made.tool} needs {', '.join(missing)}, not known here: record the unit at rest for an hour or more and "
