@@ -1012,9 +1012,9 @@ def stated_instead(name: str) -> list[tuple[type[Effect], str]]:
 
 def _to_state(effects: Sequence[Named], limits: Sizes) -> str:
     """Ask for what an option states and an effect looks like; empty where nothing is or the recording cannot see it."""
-    seen = {name.partition("@")[0] for name, (limit, _) in limits.items() if limit < CATALOGUE[name].possible}
-    asked = (one for effect in effects for one in stated_instead(effect.name))
-    return next((text for kind, text in asked if kind.name in seen), "")
+    visible = {name.partition("@")[0] for name, (limit, _) in limits.items() if limit < CATALOGUE[name].possible}
+    options = (option for effect in effects for option in stated_instead(effect.name))
+    return next((text for kind, text in options if kind.name in visible), "")
 
 
 def _suggestion(

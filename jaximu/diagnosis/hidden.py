@@ -85,8 +85,8 @@ def _hardly_seen(evidence: Evidence, name: str, limit: float) -> tuple[FloatArra
     ]
     values, vectors = np.linalg.eigh(max(informations, key=np.trace))
     weights = vectors[:, 0] * np.sign(vectors[np.argmax(np.abs(vectors[:, 0])), 0])
-    seen = values[0] > BLIND**2 * values[-1]
-    return weights, float(limit * np.sqrt(values.mean() / values[0])) if seen else float("inf")
+    shows = values[0] > BLIND**2 * values[-1]
+    return weights, float(limit * np.sqrt(values.mean() / values[0])) if shows else float("inf")
 
 
 def _spread(shift: FloatArray) -> FloatArray:
