@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.signal
 from simulated_person import GRAVITY as PERSON_GRAVITY
 from simulated_person import Person
 from synthetic import GRAVITY, POSES, recording, simulated, spread_directions, unit
@@ -15,7 +16,7 @@ from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.tracing import padded_size
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.segmentation import SegmentationOptions, observed_poses, segment
+from jaximu.recordings.segmentation import SegmentationOptions, observed_poses, rest_statistics, segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import RateTable
 from jaximu.simulation.protocols.positions import directions
@@ -322,3 +323,20 @@ def test_a_trembling_hand_widens_no_interval_and_hides_no_motion():
         errors.append((np.asarray(found.imu.gyroscope.gain) - person.gains[1]) / stated[-1])
     assert np.sqrt(np.mean(np.square(errors[:3]))) < 1.35
     assert np.median(stated[:3]) < 6 * np.median(stated[3])
+
+
+@pytest.mark.parametrize("band", [(0.6, 3.0), (6.0, 12.0)])
+def test_a_hand_that_sways_is_not_white_noise(band):
+    """Its angle stays within bounds: stated variances of mean rates are those of draws, and turns have the white."""
+    rng, rate, seconds, white, size = np.random.default_rng(3), 100.0, 4.0, 1e-4, 1e-3
+    count = int(300 * (seconds + 1) * rate)
+    shape = scipy.signal.butter(2, band, "bandpass", fs=rate, output="sos")
+    angle = scipy.signal.sosfilt(shape, rng.standard_normal((count, 3)), axis=0)
+    angle *= size / np.std(angle)
+    values = np.diff(angle, axis=0, prepend=angle[:1]) * rate + white * np.sqrt(rate) * rng.standard_normal((count, 3))
+    signal = Signal(np.arange(count) / rate, values, "rad/s")
+    start = np.arange(300) * (seconds + 1)
+    density, means, covariance = rest_statistics(signal, np.stack([start, start + seconds], axis=1), turning=True)
+    ratio = np.mean(means**2, axis=0) / np.diagonal(covariance, axis1=1, axis2=2).mean(axis=0)
+    np.testing.assert_allclose(ratio, 1.0, atol=0.35)
+    assert np.all(np.diagonal(density) < 0.5 * (np.mean(means**2, axis=0) * seconds))

@@ -340,19 +340,25 @@ def rest_statistics(
 def _without_sway(signal: Signal, columns: Sequence[FloatArray], density: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return a gyroscope's density (3, 3) without the sway of the hand that holds it, and the sway's variance · s².
 
-    A sway keeps its angle within bounds: it is off a mean rate by what its angle differs by from end to end, so that
-    its variance falls with the square of the time, that of white noise with the time. Blocks of a half and a quarter
-    of an interval tell the two apart, where the density falls by more than chance. What sways between the ends of a
+    A sway keeps its angle within bounds, of variance A²: a mean rate over T is off by the difference of its angle from
+    end to end, 2 A²/T², where white noise N leaves N²/T. Means of the n blocks of an interval, L each, scatter about
+    their mean by N²/L + 2 A²/L² · (n + 1)/n, for neighbours share an end. Halves and quarters tell the two apart, where
+    halves scatter less than the shortest blocks would have it by more than chance. What sways between the ends of a
     turn is left to the excess of the turns.
     """
-    size = int(np.quantile([column.shape[1] for column in columns], 0.2)) // 4
-    (shorter, _), (longer, freedom) = (_of_blocks(signal, columns, count * max(size, 1)) for count in (1, 2))
-    chance = np.sqrt(2 / (3 * max(freedom, 1)))
-    ratio = float((np.diagonal(longer) / np.maximum(np.diagonal(shorter), 1e-300)).mean())  # noise-free: no scatter
-    if size < signal.samples(_SHORTEST) or not freedom or ratio > 1 - _CHANCE * chance:
+    shortest, size = signal.samples(_SHORTEST), int(np.quantile([part.shape[1] for part in columns], 0.2)) // 4
+    if size < max(shortest, 1):
         return density, np.zeros((3, 3))
-    white = max(2 - 1 / ratio, chance)  # of the longer ones' density; the rest is half of that of the shorter ones
-    return white * longer, (1 - white) * longer * (2 * size / signal.rate)
+    (first, _), (quarter, _), (half, freedom) = (_of_blocks(signal, columns, n) for n in (shortest, size, 2 * size))
+    chance = np.sqrt(2 / (3 * max(freedom, 1)))
+    before, longer = (
+        float((np.diagonal(part) / np.maximum(np.diagonal(half), 1e-300)).mean())  # noise-free: no scatter
+        for part in (first, quarter)
+    )
+    if not freedom or before * (1 - _CHANCE * chance) < 1:
+        return density, np.zeros((3, 3))
+    sway = min(max(longer - 1, 0.0), (1 - chance) / 1.5)  # of the halves' density, 1 = white + 3/2 sway
+    return (1 - 1.5 * sway) * half, sway * half * (2 * size / signal.rate)
 
 
 def _across_gravity(signal: Signal, intervals: FloatArray, force: FloatArray, covariance: FloatArray) -> FloatArray:
