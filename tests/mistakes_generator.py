@@ -248,6 +248,15 @@ def jitter(log, random):
 
 
 @mistake(MISTAKES)
+def polled(log, random):
+    """A logger wakes on a coarse grid, late at times, and stamps the sensor's last sample with its own clock."""
+    step = log.period / 2
+    late = random.exponential(random.uniform(0.15, 0.3) * log.period, log.count)
+    stamps = np.maximum.accumulate(step * np.ceil((log.time + late) / step))
+    return Planted(replace(log, time=stamps + 1e-6 * step * np.arange(log.count)), ("data.jitter",))
+
+
+@mistake(MISTAKES)
 def gap(log, random):
     place = chosen(random, everywhere(log), 1)[0]
     length = round(random.uniform(0.5, 5.0) / log.period)

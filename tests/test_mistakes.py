@@ -13,6 +13,7 @@ import hidden_effects as hidden
 import mistakes_generator as generator
 import numpy as np
 import pytest
+import scipy
 
 from jaximu import InputError, LocalGravity, ReadOptions, calibrate, read_recording
 from jaximu.calibration.nominal import nominal_imu
@@ -231,6 +232,45 @@ def test_bursts_of_a_measured_log_are_put_on_a_clock(data_folder):
     assert np.median(np.abs(interval / np.median(interval) - 1)) < 1e-6
 
 
+@pytest.mark.parametrize("rate", RATES)
+def test_stamps_of_a_logger_that_polls_are_evened_out(rate):
+    case, clean = planted("polled", 3, rate), unit(3, rate)[0]
+    ready = prepare(case.log.to_recording())
+    (finding,) = ready.findings
+    assert finding.name == "data.jitter" and "as a logger polls" in finding.text
+    for name, signal in ready.signals.items():
+        assert case.log.to_recording().signals[name].rate == pytest.approx(rate, rel=1e-4)
+        late = signal.time - clean.signals[name].time
+        assert np.ptp(late) < 0.05 / rate and 0 < late.mean() < 1 / rate
+
+
+def test_a_single_late_stamp_is_no_gap():
+    log = generator.Log.of(unit(3)[0])
+    time = log.time.copy()
+    time[5000] += 0.9 * log.period
+    assert not inspect(replace(log, time=time).to_recording())
+
+
+def test_gaps_of_a_polled_log_stay_gaps():
+    log = planted("polled", 3).log
+    kept = np.delete(np.arange(log.count), np.r_[3000:3400, 7000:7003, 9000])
+    ready = prepare(log.rows(kept).to_recording())
+    (gaps, *_) = [finding for finding in ready.findings if finding.name == "data.gap"]
+    assert "3 gaps, 404 samples missing" in gaps.text
+    missing = np.diff(ready.recording.accelerometer.time) / log.period - 1
+    np.testing.assert_allclose(missing[[2999, 6599, 9000 - 404]], [400, 3, 1], atol=0.01)
+    assert np.sum(missing > 0.5) == 3
+
+
+def test_samples_that_were_taken_at_jittering_stamps_keep_them():
+    log = generator.Log.of(unit(3)[0])
+    time = log.time + np.clip(np.random.default_rng(3).normal(0, 0.2, log.count), -0.45, 0.45) * log.period
+    taken = {name: scipy.interpolate.CubicSpline(log.time, getattr(log, name))(time) for name in ("accel", "gyro")}
+    ready = prepare(replace(log, time=time, **taken).to_recording())
+    assert names(ready.findings) == {"data.jitter"}
+    np.testing.assert_array_equal(ready.recording.accelerometer.time, time)
+
+
 # --- left out and repaired
 
 
@@ -245,7 +285,8 @@ def test_bridging_three_samples_costs_less_than_the_noise():
 
 
 @pytest.mark.parametrize(
-    "name", ["zero_rows", "spikes", "wrap_around", "lost_1_percent", "bursts", "jitter", "high_passed", "held"]
+    "name",
+    ["zero_rows", "spikes", "wrap_around", "lost_1_percent", "bursts", "jitter", "polled", "high_passed", "held"],
 )
 def test_parameters_are_right_once_repaired(name):
     """Gains; biases drift, and a filter that takes the mean takes the bias. A clean unit's are off by as much."""
@@ -307,7 +348,7 @@ def test_no_effect_is_named_while_a_mistake_stands():
     assert "No effect can be named" in standing.summary().verdict[0]
 
 
-@pytest.mark.parametrize("name", ["zero_rows", "wrap_around", "jitter"])
+@pytest.mark.parametrize("name", ["zero_rows", "wrap_around", "jitter", "polled"])
 def test_a_mistake_that_is_gone_leaves_the_verdict_adequate(name):
     case = planted(name, 0)
     found = diagnose(case.log.to_recording(), GRAVITY, repair=True)

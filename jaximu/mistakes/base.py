@@ -14,7 +14,8 @@ from jaximu.ground.distributions import robust_sigma
 from jaximu.ground.vectors import dot_rows, lengths_of
 from jaximu.recordings.alignment import TURN_ANGLE, BlockMeans, Clocks, clocks, gravity_turning, of_each
 from jaximu.recordings.finding import Rows
-from jaximu.recordings.recording import GAP, Recording, Signal, floor_of, runs_of, steps_of
+from jaximu.recordings.recording import Recording, Signal, floor_of, runs_of, steps_of
+from jaximu.recordings.stamps import GAP
 
 TITLES = {
     "data.bumped_pose": "bumped pose",
@@ -92,10 +93,8 @@ class Sensor:
     @cached_property
     def curvature(self) -> FloatArray:
         """(n, 3) difference of each sample from the cubic through two neighbours on either side; zero at ends, gaps."""
-        values = self.values
-        misfit = np.zeros_like(values)
-        misfit[2:-2] = values[2:-2] - (4 * (values[1:-3] + values[3:-1]) - values[:-4] - values[4:]) / 6
-        misfit[np.clip(np.flatnonzero(~self.even)[:, None] + np.arange(-1, 3), 0, len(values) - 1)] = 0.0
+        misfit = off_cubic(self.values)
+        misfit[np.clip(np.flatnonzero(~self.even)[:, None] + np.arange(-1, 3), 0, len(misfit) - 1)] = 0.0
         return misfit
 
     @cached_property
@@ -301,6 +300,13 @@ class Samples:
             return None
         cosine = dot_rows(means[1:], means[:-1]) / np.maximum(size[1:] * size[:-1], 1e-300)
         return int(np.sum(cosine < np.cos(TURN_ANGLE)))
+
+
+def off_cubic(values: FloatArray) -> FloatArray:
+    """Return by how much values (n, m) are off the cubic through two neighbours on either side; zero at the ends."""
+    misfit = np.zeros_like(values)
+    misfit[2:-2] = values[2:-2] - (4 * (values[1:-3] + values[3:-1]) - values[:-4] - values[4:]) / 6
+    return misfit
 
 
 def spans_of(flags: BoolArray, time: FloatArray, shortest: float) -> FloatArray:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import counted
-from jaximu.ground.units import SENSOR_UNITS
-from jaximu.mistakes.base import Samples, Sensor
+from jaximu.mistakes.base import Samples, Sensor, off_cubic
 from jaximu.recordings.finding import Finding
-from jaximu.recordings.recording import FASTEST, GAP, Recording
+from jaximu.recordings.recording import FASTEST, Recording
+from jaximu.recordings.stamps import UNEVEN, missing_samples
 
 TITLES = {
     "data.bursts": "stamps in bursts",
@@ -26,6 +27,12 @@ _SLOWEST = 1.0
 """Hz: no log of poses and turns has a lower rate."""
 _SUDDEN = 0.3
 """Share of the mean interval below which two samples arrived together."""
+_LASTING = 20
+"""Samples over whose mean a steady clock must not be late."""
+_SURE = 14.0
+"""Nats from which on samples were taken at even times, or at their stamps."""
+_FAR = 6.0
+"""Times the usual misfit of a sample beyond which it is a spike."""
 
 
 def find(samples: Samples) -> list[Finding]:
@@ -33,16 +40,14 @@ def find(samples: Samples) -> list[Finding]:
     findings = []
     for name, sensor in samples.sensors.items():
         if samples.shared and name == "gyroscope":
-            first = [finding for finding in findings if finding.name in ("data.bursts", "data.time_scale")]
-            if first:  # said once for both
+            if any(finding.apply or finding.name == "data.time_scale" for finding in findings):  # said once for both
                 continue
-        findings += _timing(name, sensor)
+        findings += _timing(name, sensor, [*samples.sensors.values()] if samples.shared else [sensor])
     return findings
 
 
-def _timing(name: str, sensor: Sensor) -> Iterator[Finding]:
+def _timing(name: str, sensor: Sensor, alike: Sequence[Sensor]) -> Iterator[Finding]:
     interval = sensor.interval
-    usual = sensor.period
     mean = np.mean(interval)
     if in_bursts(interval):
         rate, lag = 1 / _clock(sensor.time)[1], np.quantile(interval, 0.99)
@@ -63,53 +68,57 @@ def _timing(name: str, sensor: Sensor) -> Iterator[Finding]:
             "second: the unit of the time column is wrong. Change it in the header or with --columns.",
             spoils=True,
         )
-    spread = np.std(interval[interval < 1.5 * usual])
-    uneven = spread > 0.1 * usual
-    gaps = np.flatnonzero(interval > (2.5 if uneven else GAP) * usual)
+    missing = missing_samples(sensor.time)
+    gaps = np.flatnonzero(missing)
     if len(gaps):
-        lost = int(np.sum(np.round(interval[gaps] / usual) - 1))
         yield Finding(
             "data.gap",
             sensor.rows(gaps + 1),
-            f"{name}: {counted(len(gaps), 'gap')}, {counted(lost, 'sample')} missing, the longest "
-            f"{interval.max():.3g} s, after {sensor.time[gaps[np.argmax(interval[gaps])]]:.1f} s. Turns across "
+            f"{name}: {counted(len(gaps), 'gap')}, {counted(int(missing.sum()), 'sample')} missing, the longest "
+            f"{interval[gaps].max():.3g} s, after {sensor.time[gaps[np.argmax(interval[gaps])]]:.1f} s. Turns across "
             "long gaps are left out.",
         )
-    if uneven:
-        even = _smoother_evenly(sensor)
-        yield Finding(
-            "data.jitter",
-            (),
-            f"{name}: stamps jitter by {1e3 * spread:.2g} ms from sample to sample, {100 * spread / usual:.0f} % "
-            "of "
-            + (
-                "the interval, and the samples are smooth at even times: a steady clock fitted to the stamps "
-                "replaces them."
-                if even
-                else "the interval. If the sensor samples evenly, its own clock is better than the "
-                "logger's: leave the time column out (_ in --columns) and give --rate."
-            ),
-            apply=_evenly if even else None,
+    spread = np.std(interval[missing == 0])
+    if spread > UNEVEN * mean:
+        even = _even(sensor.time)
+        evidence = 0.0 if even is None else sum(_taken_evenly(one, even) for one in alike)
+        grid = _grid(interval[missing == 0])
+        text = (
+            f"{name}: stamps jitter by {1e3 * spread:.2g} ms from sample to sample, {100 * spread / mean:.0f} % of the "
+            f"interval{f', in steps of {1e3 * grid:.3g} ms, as a logger polls' if grid > spread else ''}"
         )
+        apply = None
+        if even is not None and evidence > _SURE:
+            apply = partial(_evenly, sensor=sensor, even=even)
+            text += (
+                f", and the samples were taken at even times: a steady clock of {1 / np.median(np.diff(even)):.5g} Hz "
+                "fitted to the stamps replaces them."
+            )
+        elif evidence < -_SURE:
+            text += ", and the samples were taken at the times of the stamps, which are used as they are."
+        else:
+            text += (
+                ". If the sensor samples evenly, its own clock is better than the logger's: leave the time column out "
+                "(_ in --columns) and give --rate."
+            )
+        yield Finding("data.jitter", (), text, apply=apply)
+
+
+def _grid(interval: FloatArray) -> float:
+    """Return the step that intervals (n,) come in, s; zero where they come in none that is coarse."""
+    levels = np.unique(np.round(interval, 6))
+    step = np.diff(levels, prepend=0.0).max()
+    return float(step) if np.max(np.abs(levels - step * np.round(levels / step))) < 0.01 * step else 0.0
 
 
 def _even(time: FloatArray) -> FloatArray | None:
-    """Stamps (n,) of the samples on a steady clock, gaps counted; None for few, or where they are off by more."""
+    """Stamps (n,) of the samples on a steady clock, gaps counted; None for few, or where they stay off by more."""
     if len(time) < 200:
         return None
-    interval = np.diff(time)
-    breaks = np.flatnonzero(interval > 2.5 * np.median(interval)) + 1
-    number = np.arange(len(time), dtype=np.float64)
-    slopes = [np.polyfit(number[a:b], time[a:b], 1)[0] for a, b in pairwise([0, *breaks, len(time)]) if b - a > 100]
-    if not slopes:
-        return None
-    period = np.median(slopes)
-    for row in breaks:
-        delay = time - period * number
-        missing = np.round((np.mean(delay[row : row + 20]) - np.mean(delay[max(0, row - 20) : row])) / period)
-        number[row:] += max(0.0, missing)
+    number = np.arange(len(time)) + np.cumulative_sum(missing_samples(time), include_initial=True)
     even, slope = _line(number, time)
-    return even if np.max(np.abs(time - even)) < 0.75 * slope else None
+    lasting = np.convolve(time - even, np.full(_LASTING, 1 / _LASTING), "valid")
+    return even if np.max(np.abs(lasting)) < 0.75 * slope else None
 
 
 def _line(number: FloatArray, time: FloatArray) -> tuple[FloatArray, float]:
@@ -118,27 +127,34 @@ def _line(number: FloatArray, time: FloatArray) -> tuple[FloatArray, float]:
     return start + slope * number, slope
 
 
-def _evenly(recording: Recording) -> Recording:
-    """Return the recording with jittering stamps of its triads replaced by those of a steady clock."""
+def _evenly(recording: Recording, sensor: Sensor, even: FloatArray) -> Recording:
+    """Return the recording with the stamps of a sensor, and of all that share them, replaced by those of a clock."""
     changed = {
         name: replace(signal, time=even)
         for name, signal in recording.signals.items()
-        if name in SENSOR_UNITS and (even := _even(signal.time)) is not None
+        if np.array_equal(signal.time, sensor.time)
     }
     return replace(recording, **changed)
 
 
-def _smoother_evenly(sensor: Sensor) -> bool:
-    """Whether the samples in motion lie on smoother curves by their number than by their stamps."""
-    even = _even(sensor.time)
-    if even is None:
-        return False
-    bends = []
-    for time in (even, sensor.time):
-        bend = np.abs(np.diff(sensor.difference / np.diff(time)[:, None], axis=0)).sum(axis=1) * sensor.period
-        moving = np.abs(sensor.difference[1:]).sum(axis=1) > 6 * np.sum(sensor.noise)
-        bends.append(np.median(bend[moving]) if moving.sum() > 50 else np.inf)
-    return bends[0] < 0.8 * bends[1]
+def _taken_evenly(sensor: Sensor, even: FloatArray) -> float:
+    """Return by how many nats the samples in motion were taken at even times (n,) rather than at their stamps.
+
+    Samples taken at the stamps are off smooth curves by the slope times the deviation of their stamps, in the mean over
+    neighbours; those taken at even times are not. The slope at a sample, whose noise is that of its neighbours, is
+    multiplied with the slope around them.
+    """
+    values, period = sensor.values, float(np.mean(np.diff(even)))
+    deviation = off_cubic((sensor.time - even)[:, None] / period)
+    near, wide = np.zeros_like(values), np.zeros_like(values)
+    near[1:-1] = (values[2:] - values[:-2]) / 2
+    wide[4:-4] = (values[7:-1] + values[8:] - values[1:-7] - values[:-8]) / 14
+    misfit, scale = sensor.curvature, np.maximum(sensor.local, 1e-300)
+    used = (misfit != 0) & (np.abs(misfit) < _FAR * scale)
+    around = np.where(used, wide * deviation / scale**2, 0.0)
+    expected, seen = np.sum(around * near * deviation), np.sum(around * misfit)
+    variance = np.sum((around * (misfit - seen / expected * near * deviation)) ** 2)
+    return float(expected * (expected - 2 * seen) / (2 * variance)) if variance > 0 else 0.0
 
 
 def in_bursts(interval: FloatArray) -> bool:

@@ -27,6 +27,7 @@ from jaximu.ground.tracing import is_traced
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, STANDARD_GRAVITY
 from jaximu.ground.vectors import lengths_of
 from jaximu.recordings.alignment import CORRELATED, Turning, turning, turns_backwards
+from jaximu.recordings.stamps import missing_samples
 
 if TYPE_CHECKING:
     import pandas as pd  # pyright: ignore[reportMissingImports]
@@ -36,10 +37,6 @@ if TYPE_CHECKING:
 
 def _unset() -> FloatArray:
     return np.empty(0)
-
-
-GAP = 1.6
-"""Times the usual interval from which on a longer one is a gap."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,10 +93,7 @@ class Signal(Comparable):
 
         One over the median interval would be the rate at which stamps are rounded, or a logger polls.
         """
-        interval = np.diff(self.time)
-        usual = np.median(interval)
-        longest = GAP * max(usual, np.minimum(interval, 3 * usual).mean())
-        return float(1.0 / interval[interval <= longest].mean())
+        return float(1.0 / np.diff(self.time)[missing_samples(self.time) == 0].mean())
 
     @property
     def edges(self) -> FloatArray:
