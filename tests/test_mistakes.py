@@ -106,6 +106,23 @@ def test_rows_that_are_left_out_are_no_motion_to_start_from(triad):
     np.testing.assert_allclose(gyroscope.gain, np.eye(3), atol=0.1)
 
 
+@pytest.mark.parametrize("name", ["sway", "tremor"])
+def test_a_hand_that_moves_is_not_taken_for_a_filter(name):
+    """Sway falls off above 3 Hz and tremor above 9 Hz, to white noise; what a filter passes has none."""
+    for seed in range(3):
+        log, random = generator.Log.of(unit(seed)[0]), np.random.default_rng([seed, 12])
+        low, high = {"sway": (0.5, 3.0), "tremor": (7.0, 11.0)}[name]
+        shaking = scipy.signal.sosfilt(
+            scipy.signal.butter(2, (low, high), "bandpass", fs=1 / log.period, output="sos"),
+            random.standard_normal((log.count, 3)),
+            axis=0,
+        )
+        hand = replace(log, gyro=log.gyro + 0.02 * shaking / shaking.std()).to_recording()
+        assert "data.bandwidth" not in names(inspect(hand)), (seed, [finding.text for finding in inspect(hand)])
+        filtered = generator.filtered(generator.Log.of(hand), 5.0, 2).to_recording()
+        assert "data.bandwidth" in names(inspect(filtered))
+
+
 def test_lost_samples_are_counted_with_their_rows():
     case = planted("lost_1_percent", 4)
     (finding,) = [each for each in inspect(case.log.to_recording()) if each.name == "data.lost_samples"]

@@ -86,6 +86,10 @@ _FALL_AT_REST = 0.35
 """The same of a unit at rest, whose spectrum is noise alone: one pole at 0.4 times half the rate leaves 0.31."""
 _SURE = 10.0
 """Nats that a pole must explain of a spectrum at rest beyond what a power of frequency does."""
+_ORDERS, _FAR_ABOVE = 7, 30.0
+"""Poles that a filter has less than; times the density of rounding from which on a floor of the spectrum is noise."""
+_WHITE = 20.0
+"""Nats that such a floor must explain beyond what poles alone do, whose shape is not exactly that of any filter."""
 _HARMLESS = 20.0
 """Hz from which on a filter does nothing to motion by hand; at rest it changes the noise at any corner."""
 _SLOPE = -1.2
@@ -106,7 +110,7 @@ def _bandwidth(samples: Samples, sensor: Sensor, power: FloatArray, count: int, 
     corners = []
     for axis, density in enumerate(power.T):
         low = np.max(scipy.ndimage.median_filter(density[2 : len(density) // 2], 5)[2:-2], initial=0.0)
-        if not low > 30 * max(floor[axis], 1e-30):
+        if not low > _FAR_ABOVE * max(floor[axis], 1e-30):
             continue
         upper = (frequency > 0.3 * half) & (frequency < 0.95 * half)
         top = np.median(density[frequency > 0.85 * half])
@@ -116,7 +120,9 @@ def _bandwidth(samples: Samples, sensor: Sensor, power: FloatArray, count: int, 
         below = np.flatnonzero(scipy.ndimage.median_filter(density, 3, mode="constant")[2:] < low / 2) + 2
         corner = float(frequency[below[0]]) if len(below) else half
         # a corner far below: what is left above may be flat again, by rounding or by an imperfect filter
-        deep = top < 1e-3 * low and top < 30 * floor[axis]
+        deep = top < 1e-3 * low and top < _FAR_ABOVE * floor[axis]
+        if not samples.rested and _falls_to_white_noise(density, count, floor[axis]):
+            continue
         falls = slope < _SLOPE or (samples.rested and _has_pole(density, count))
         if (falls or deep) and corner < (0.6 * half if samples.rested else min(0.45 * half, _HARMLESS)):
             corners.append(corner)
@@ -150,6 +156,27 @@ def _has_pole(density: FloatArray, count: int) -> bool:
 
     poles = [cost(1 / (1 + turn / corner)) for corner in np.geomspace(turn[0], 1.0, 30)]
     return min(poles) + _SURE < min(cost(index**-power) for power in np.linspace(0.0, 3.0, 31))
+
+
+def _falls_to_white_noise(density: FloatArray, count: int, rounding: float) -> bool:
+    """Whether the mean (f,) of so many spectra falls to white noise far above rounding, as a hand's motion does.
+
+    A filter takes the noise away with the motion: above its corner the density goes on falling, by some poles.
+    """
+    peak = int(np.argmax(scipy.ndimage.median_filter(density, 5)[_LOBE:-_LOBE])) + _LOBE
+    index = np.arange(max(peak, _LOBE + 1), len(density) - 1)
+    part, share = density[index], index / (len(density) - 1)
+    steps = np.stack([share, np.sin(np.pi / 2 * share)]) ** 2  # of a filter ahead of the sampling, and of one behind it
+    corners = np.geomspace(steps[1, 0], 1.0, 30)
+    poles = 1 / (1 + steps[:, None] / corners[:, None])
+    falls = np.concatenate([poles**order for order in range(1, _ORDERS)]).reshape(-1, 1, len(index))
+    levels = np.concatenate([[0.0], np.geomspace(1e-8, 1.0, 33)])
+    shapes = falls + levels[:, None]
+    amplitude = np.mean(part / shapes, axis=2)
+    cost = count * len(index) * (np.mean(np.log(shapes), axis=2) + np.log(amplitude))
+    fall, level = np.unravel_index(np.argmin(cost), cost.shape)
+    white = amplitude[fall, level] * levels[level]
+    return bool(cost[:, 0].min() - cost[fall, level] > _WHITE and white > _FAR_ABOVE * rounding)
 
 
 def _still_parts(samples: Samples, sensor: Sensor) -> FloatArray | None:
