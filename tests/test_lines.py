@@ -139,22 +139,41 @@ def test_a_line_through_zero_is_named_and_no_drift(recording, tmp_path):
 
 def measured(folder, name):
     options = ReadOptions(accel_scale="2048 count/g", gyro_scale="16.4 count/(deg/s)")
-    return moving_lines(calibrate(read_recording(folder / f"mimu4444/{name}.parquet", options=options)).segmentations)
+    return calibrate(read_recording(folder / f"mimu4444/{name}.parquet", options=options)).segmentations
 
 
 def test_lines_of_a_measured_board(data_folder):
     """Read off spectrograms: y drifts from 4 Hz to zero towards the end, z from 13 to 14.5 Hz."""
-    lines = {line.axis: line for line in measured(data_folder, "unit1_session1")}
+    parts = measured(data_folder, "unit1_session1")
+    lines = {line.axis: line for line in moving_lines(parts)}
     assert set(lines) == {"gyroscope y", "gyroscope z"}
     (zero,) = lines["gyroscope y"].line.folds(0.0)
     assert 330 < zero < 420
     shown = lines["gyroscope z"].line.recorded
     assert shown[0] == pytest.approx(12.9, abs=0.3) and shown[-1] == pytest.approx(14.5, abs=0.3)
-    assert "crosses zero frequency" in line_findings([lines["gyroscope y"]])[0].text
+    assert "crosses zero frequency" in line_findings([lines["gyroscope y"]], parts)[0].text
+    second = [replace(line, recording=1) for line in lines.values()]  # of two recordings that are diagnosed together
+    texts = [finding.text for finding in line_findings([*lines.values(), *second], [parts[0], parts[0]])]
+    assert len(texts) == 4 and all(text.startswith("In unit1_session1.parquet: gyroscope ") for text in texts)
+
+
+@pytest.mark.parametrize(
+    ("frequency", "words"),
+    [
+        ([18.9, 18.5, 18.88], "wanders between 18.5 and 18.9 Hz"),
+        ([0.8, -0.4, -0.85], "wanders between 0.0 and 0.9 Hz, crosses zero frequency at t = "),
+        ([12.80, 13.5, 14.52], "moves from 12.8 to 14.5 Hz"),
+    ],
+)
+def test_a_line_that_comes_back_does_not_move_from_a_frequency_to_itself(frequency, words):
+    times = np.linspace(0.0, 100.0, 41)
+    course = np.interp(times, [0, 50, 100], frequency)
+    line = SpectralLine(2, times, course, np.ones(41, bool), 1e-3, 60.0, 0.1, 90.0, 0.0)
+    assert words in MovingLine(0, "gyroscope", line).words
 
 
 def test_a_quiet_unit_of_the_board_has_no_line_that_moves(data_folder):
-    assert not measured(data_folder, "unit6_session1")
+    assert not moving_lines(measured(data_folder, "unit6_session1"))
 
 
 def part(unit, session, *courses):

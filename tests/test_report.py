@@ -22,7 +22,7 @@ from jaximu.ground.quantities import number
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
 from jaximu.report import write_report
-from jaximu.report.diagnosis import gained
+from jaximu.report.diagnosis import gained, with_another
 from jaximu.report.evidence import evidence, largest_gap
 from jaximu.report.figures import dressed, envelope, logarithmic, new_figure, residual_figure
 from jaximu.report.tables import short_name, snippet
@@ -391,3 +391,8 @@ def test_a_gain_is_said_in_the_measure_that_is_shown(after, likelier, says):
     gain = Gain(predicted(39.0, 0.0), predicted(after, likelier), "5 parts")
     cause = SimpleNamespace(effect=CATALOGUE["accel.step"].make(0.01))
     assert gained(SimpleNamespace(gain=gain, learned=None, named=[cause])).endswith(says)
+
+
+@pytest.mark.parametrize(("count", "words"), [(1, "both recordings together"), (4, "all 5 recordings together")])
+def test_recordings_are_counted_with_the_new_one(count, words):
+    assert with_another(SimpleNamespace(calibration=SimpleNamespace(segmentations=[None] * count))) == words

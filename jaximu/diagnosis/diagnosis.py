@@ -457,7 +457,7 @@ def _with_lines(diagnosis: Diagnosis, before: Diagnosis | None, lines: tuple[Mov
         if gone:
             named = listed([effect_title(name) for name in gone])
             notes = (*notes, f"with the line that looks like bias drift left in, {named} would have been named.")
-    findings = (*diagnosis.preflight, *line_findings(lines, text))
+    findings = (*diagnosis.preflight, *line_findings(lines, diagnosis.calibration.segmentations, text))
     return replace(diagnosis, preflight=findings, notes=notes, lines=lines)
 
 

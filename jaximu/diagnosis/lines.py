@@ -12,6 +12,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import counted, size
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes.base import Sensor
+from jaximu.mistakes.preparation import of_one
 from jaximu.noise.lines import SpectralLine, follow, spectra, swing, windows_at_rest
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Signal
@@ -45,9 +46,11 @@ class MovingLine:
         """From where to where it moves, and where it folds."""
         line = self.line
         shown = line.recorded[line.visible]
-        text = (
-            f"a line of {size(line.size, SENSOR_UNITS[self.triad], 2)} moves from {shown[0]:.3g} to {shown[-1]:.3g} Hz"
-        )
+        ends = (shown.min(), shown.max()) if line.returns else shown[[0, -1]]
+        decimals = max(0, int(np.ceil(-np.log10(line.resolution))))
+        first, last = (f"{frequency:.{decimals}f}" for frequency in ends)
+        course = f"wanders between {first} and {last} Hz" if line.returns else f"moves from {first} to {last} Hz"
+        text = f"a line of {size(line.size, SENSOR_UNITS[self.triad], 2)} {course}"
         if len(zero := line.folds(0.0)):
             text += f", crosses zero frequency at t = {zero[0]:.0f} s, where it looks like bias drift and is none"
         if len(half := line.folds(0.5)):
@@ -111,8 +114,11 @@ def swings_of(
     return swings
 
 
-def line_findings(lines: Sequence[MovingLine], gain: str = "") -> list[Finding]:
-    """Return a finding for each axis with lines that move; `gain`: what taking off those near zero frequency gained."""
+def line_findings(lines: Sequence[MovingLine], segmentations: Sequence[Segmentation], gain: str = "") -> list[Finding]:
+    """Return a finding for each axis with lines that move, of several recordings with the file of its own.
+
+    `gain`: what taking off those near zero frequency gained.
+    """
     findings = []
     for recording, axis in dict.fromkeys((one.recording, one.axis) for one in lines):
         mine = [one for one in lines if (one.recording, one.axis) == (recording, axis)]
@@ -120,7 +126,8 @@ def line_findings(lines: Sequence[MovingLine], gain: str = "") -> list[Finding]:
         more = f"; and {counted(len(mine) - _NAMED, 'more line')}" if len(mine) > _NAMED else ""
         slow = any(one.line.slow for one in mine)
         text = f"{axis}: {'; '.join(texts)}{more}. {gain if slow else ''}".rstrip()
-        findings.append(Finding(MOVING_LINE, (), text[0].upper() + text[1:]))
+        finding, part = Finding(MOVING_LINE, (), text), segmentations[recording].recording
+        findings.append(finding if len(segmentations) == 1 else of_one(finding, part, recording + 1))
     return findings
 
 

@@ -208,8 +208,14 @@ def _leaves_out_much(ready: Prepared, finding: Finding) -> bool:
 
 def _named(ready: Prepared, number: int) -> Prepared:
     """Return one of several recordings, its name or number in all that was found in it."""
-    files = " and ".join(Path(source.path).name for source in ready.recording.sources) or f"recording {number}"
-    return replace(ready, findings=tuple(replace(note, text=f"In {files}: {note.text}") for note in ready.findings))
+    findings = (of_one(finding, ready.recording, number) for finding in ready.findings)
+    return replace(ready, findings=tuple(findings))
+
+
+def of_one(finding: Finding, recording: Recording, number: int) -> Finding:
+    """Return a finding in one of several recordings, which its text names by their files or else by its number."""
+    files = " and ".join(Path(source.path).name for source in recording.sources) or f"recording {number}"
+    return replace(finding, text=f"In {files}: {finding.text}")
 
 
 def without_rows(recording: Recording, rows: Mapping[str, Rows]) -> Recording:

@@ -83,6 +83,12 @@ class SpectralLine:
         return bool(wide and self.evidence - max(self.steady, 0.0) > _ENOUGH)
 
     @property
+    def returns(self) -> bool:
+        """Whether it is recorded in the end where it was at the start, as far as windows resolve."""
+        first, last = self.recorded[self.visible][[0, -1]]
+        return bool(abs(last - first) < _LOBE * self.resolution)
+
+    @property
     def slow(self) -> bool:
         """Whether it comes so close to zero frequency that a window shows it as drift."""
         return bool(self.folds(0.0).size or np.min(self.recorded) < _LOBE * self.resolution)

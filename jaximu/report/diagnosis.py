@@ -11,7 +11,7 @@ from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.hidden import Hidden
 from jaximu.diagnosis.improvement import Gain
 from jaximu.diagnosis.learned import LearnedTerm
-from jaximu.diagnosis.lines import spectrum_at_rest
+from jaximu.diagnosis.lines import MovingLine, spectrum_at_rest
 from jaximu.diagnosis.noise import NoiseFinding
 from jaximu.estimation.rows import TIME
 from jaximu.estimation.uncertainty import describe
@@ -224,11 +224,17 @@ def _next(diagnosis: Diagnosis) -> str:
         command = f"`jaximu diagnose {' '.join([*files, *repairs])} -o RESULTS`"
         return f"{diagnosis.suggestion} {command} repeats the diagnosis."
     if diagnosis.suggestion:
-        together = f"`jaximu diagnose {' '.join(files)} NEW_LOG -o RESULTS` diagnoses both recordings together."
+        together = f"`jaximu diagnose {' '.join(files)} NEW_LOG -o RESULTS` diagnoses {with_another(diagnosis)}."
         recorded = by_hand and " record" in diagnosis.suggestion and not _standing(diagnosis)
         return diagnosis.suggestion + f" {together}" * recorded
     what = "extended calibration" if diagnosis.extended.effects else "calibration"
     return compensation(diagnosis.calibration.files, f"applies the {what}")
+
+
+def with_another(diagnosis: Diagnosis) -> str:
+    """Return how many recordings they are with a new one, in words."""
+    count = len(diagnosis.calibration.segmentations)
+    return f"{'both' if count == 1 else f'all {count + 1}'} recordings together"
 
 
 def _mistake(diagnosis: Diagnosis, finding: Finding) -> Statement:
@@ -254,7 +260,7 @@ def _effect_row(effect: Named | NoiseFinding) -> tuple[str, str, str, str]:
 
 def _lines_figure(diagnosis: Diagnosis) -> Figure:
     parts = diagnosis.calibration.segmentations
-    lines = {}
+    lines: dict[tuple[int, str, int], list[MovingLine]] = {}
     for one in diagnosis.lines:
         lines.setdefault((one.recording, one.triad, one.line.axis), []).append(one)
     figure, grid = figures.stacked(min(len(lines), _PANELS), 2.4, 0.6)
@@ -277,7 +283,9 @@ def _lines_figure(diagnosis: Diagnosis) -> Figure:
                 linewidth=1.2,
                 alpha=0.8,
             )
-        dressed(axes, mine[0].axis, ylabel="frequency (Hz)")
+        files = [source.path for source in parts[key[0]].recording.sources]
+        title = f"{mine[0].axis} in {file_names(files)}" if len(parts) > 1 else mine[0].axis
+        dressed(axes, title, ylabel="frequency (Hz)")
     grid[-1].set_xlabel("time (s)")
     return figure
 
