@@ -10,6 +10,7 @@ from simulated_board import PATTERN, board
 from jaximu.cli.app import main
 from jaximu.diagnosis import COMMON_DRIFT, attribute, places_of
 from jaximu.diagnosis.attribution import attributed, split
+from jaximu.diagnosis.lines import MOVING_LINE
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model.effects import CATALOGUE
 from jaximu.report.html import write_report
@@ -59,6 +60,26 @@ def test_a_curve_of_one_recording_belongs_to_nothing(attribution):
     findings, single, _ = attributed(parts, [], 0.05)
     assert [finding.name for finding in findings] == ["gyro.g_sensitivity"]
     assert single == {"gyro.learned_time": ["unit 1 in session 1"]}
+
+
+def test_an_effect_that_a_unit_has_is_named_where_it_does_not_repeat(attribution):
+    parts = list(attribution.recordings)
+    parts[1] = replace(parts[1], named=parts[0].named)
+    assert attributed(parts, [], 0.05)[1] == {"gyro.g_sensitivity": ["unit 2 in session 1"]}
+
+
+def test_what_repeats_is_not_denied_and_the_next_command_is_for_an_effect(attribution):
+    (effect,) = [finding for finding in attribution.findings if finding.belongs_to == "unit"]
+    assert "unit1_session1.csv unit1_session2.csv -o RESULTS` diagnoses all recordings of unit 1" in (
+        replace(attribution, findings=(effect,)).suggestion
+    )
+    line = replace(effect, name=MOVING_LINE, values={"1": [18.9]}, unit="Hz")
+    elsewhere = replace(attribution, findings=(line,), single={MOVING_LINE: ["unit 1 in session 1"]})
+    assert not elsewhere.suggestion
+    (note,) = elsewhere.notes
+    assert "beside what repeats" in note and "neither" not in note
+    (note,) = replace(elsewhere, findings=()).notes
+    assert "repeats neither over sessions nor over units" in note
 
 
 def test_document_and_page(attribution, tmp_path):

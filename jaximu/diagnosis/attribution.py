@@ -12,6 +12,7 @@ compared with what drift as large and as slow in each unit, but independent, has
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import PurePath
@@ -466,8 +467,8 @@ class Attribution(Result, Document, page="attribution"):
     """What belongs to units, to sessions and to the board, from recordings of several units in several sessions.
 
     recordings: as diagnosed, a time course common to their session taken off. findings: what they belong to. drifts:
-    by session, what its units have in common in time. single: effects that show in single recordings alone, by name,
-    and which. skipped: recordings that could not be diagnosed, and why.
+    by session, what its units have in common in time. single: recordings that show an effect, by its name, which
+    repeats nowhere there. skipped: recordings that could not be diagnosed, and why.
     """
 
     recordings: tuple[BoardRecording, ...]
@@ -550,17 +551,25 @@ class Attribution(Result, Document, page="attribution"):
                 "Log the temperature and the supply of the board with the next session: if the common time course "
                 "follows one of them, it can be compensated. It is no part of any unit's calibration."
             )
-        if any(finding.belongs_to == "unit" for finding in self.findings):
-            return (
-                "Run `jaximu diagnose` on all recordings of a unit with an effect: it writes the extended calibration."
-            )
-        return ""
+        effects = (one for one in self.findings if one.belongs_to == "unit" and one.name in CATALOGUE)
+        units = _in_order(unit for finding in effects for unit in finding.units)
+        if not units:
+            return ""
+        files = shlex.join(part.file for part in self.recordings if part.unit == units[0])
+        others = f" Likewise unit{'s' * (len(units) > 2)} {listed(units[1:])}." if len(units) > 1 else ""
+        return (
+            f"`jaximu diagnose {files} -o RESULTS` diagnoses all recordings of unit {units[0]} together and writes its "
+            f"calibration with what belongs to it.{others}"
+        )
 
     @property
     def notes(self) -> list[str]:
         """What a reader should know beside the verdict."""
+        repeated = {finding.name for finding in self.findings}
         return [
-            f"{effect_title(name)} repeats neither over sessions nor over units; it shows in {listed(places)}."
+            f"{effect_title(name)}: beside what repeats there are others, in {listed(places)}."
+            if name in repeated
+            else f"{effect_title(name)} repeats neither over sessions nor over units; it shows in {listed(places)}."
             for name, places in self.single.items()
         ] + [f"{file} was skipped: {why}" for file, why in self.skipped.items()]
 
@@ -736,8 +745,10 @@ def attributed(
             "session": [part.session for part in parts],
         }
         divided = split(estimates, owners["unit"], owners["session"], level / len(strongest))
+        apart = _places(parts, name)
         for share in divided.parts:
             mine = [part for part, owner in zip(parts, owners[share.belongs_to], strict=True) if owner in share.values]
+            apart = [place for place in apart if place not in {part.place for part in mine}]
             findings.append(
                 Attributed(
                     name,
@@ -752,8 +763,8 @@ def attributed(
             )
         if divided.parts:
             beside[name] = inner
-        else:
-            single[name] = _places(parts, name)
+        if apart:
+            single[name] = apart
         if divided.parts and kind.scope == "device":
             for index, part in enumerate(parts):
                 predictions[index] += part.known(name, inner, *divided.predicted(index))
