@@ -85,6 +85,11 @@ _NO_BETTER = (
     "on parts left out the heading is {after:.2g}° off the gyroscope's with this calibration and {before:.2g}° as "
     "logged (rms): it does not improve the heading. Turn the unit through more directions, away from iron."
 )
+_OPEN_HEADING = (
+    "a level heading is uncertain by {:.2g}° with this calibration (one standard deviation), which changes it by "
+    "{:.2g}° (rms): whether that improves it is open. Turn the unit through more directions{}."
+)
+_CALIBRATED = ", or state a calibration of its accelerometer and gyroscope (--calibration)"
 _ALIKE_ERRORS = (
     "the field's strength differs from its mean for seconds at a time, as beside iron or where a sensor drifts: the "
     "intervals allow for it."
@@ -285,6 +290,10 @@ def _calibrated(
         "next": None if dip is None else next_directions(calibration, measurement, dip),
         "disturbed": whole.time[~windows.used].tolist(),
     }
+    if (error := magnetic["heading_error"]) is not None and open_heading(error):
+        advice = _CALIBRATED if base is None else ""
+        text = _OPEN_HEADING.format(error["rms"], error["before"]["rms"], advice)
+        calibration = replace(calibration, notes=(*calibration.notes, text))
     calibration = replace(calibration, covariance=fit.total_covariance(field.sigma), magnetic=magnetic)
     return _with_base(calibration, base), measurement, heading
 
@@ -850,6 +859,11 @@ def heading_errors(calibration: Calibration, start: Imu, strength: float, dip: f
     scatter = np.sqrt(calibration.excess.get(EXCESS_NAMES[0], 0.0)) * 0.1 / (strength * np.cos(dip))
     sigma, off = (np.degrees(values).reshape(len(tilts), len(headings)) for values in (sigma, off))
     return Heading(headings, tilts, sigma, off, float(np.degrees(scatter)))
+
+
+def open_heading(error: Json) -> bool:
+    """Whether a calibrated heading is less certain than what the calibration changes; error: `heading_error`."""
+    return error["rms"] > error["before"]["rms"]
 
 
 def _of_iron(name: Name) -> bool:

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from jaximu.calibration import Calibration, Heading
-from jaximu.calibration.magnetometer import hard_iron
+from jaximu.calibration.magnetometer import hard_iron, open_heading
 from jaximu.data.field import MagneticField
 from jaximu.estimation.uncertainty import signed_axes
 from jaximu.ground.document import Json
@@ -39,11 +39,16 @@ def _lead(calibration: Calibration) -> tuple[str, str, str]:
             f"{100 * spread['after']:.2g} %",
             "scatter of the field's strength on parts of the recording that were left out of the fit",
         )
+    now, before = (f"{number(value, 2)}°" for value in (heading["rms"], heading["before"]["rms"]))
+    improved = (
+        f"known to {now} only (one standard deviation), more than the {before} (rms) by which calibrating changes it"
+        if open_heading(heading)
+        else f"good to {now} (one standard deviation); without calibration it is off by {before} (rms)"
+    )
     return (
-        f"A level heading in this recording's surroundings is good to {number(heading['rms'], 2)}° (one standard "
-        f"deviation); without calibration it is off by {number(heading['before']['rms'], 2)}° (rms). Iron elsewhere, "
-        f"which one recording does not show, is not in the figure. After calibration {strength}.",
-        f"{number(heading['rms'], 2)}°",
+        f"A level heading in this recording's surroundings is {improved}. Iron elsewhere, which one recording does not "
+        f"show, is not in the figure. After calibration {strength}.",
+        now,
         "standard deviation of the heading of a level unit whose vertical is known, in this field",
     )
 
