@@ -385,6 +385,10 @@ def test_command(calibration, tmp_path, capsys):
     assert main([*arguments, "--fail-on", "invalid"]) == 1
     said = " ".join(capsys.readouterr().out.split())
     assert "no longer valid: accelerometer bias x moved by +" in said and "mm/s²" in said
+    write_recording(recorded(5), log)
+    assert main(arguments) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "CALIBRATION" not in said and "jaximu compensate /" in said and "/calibration.json /" in said
     damaged = tmp_path / "damaged.json"
     damaged.write_text((tmp_path / "calibration.json").read_text(encoding="utf-8")[:500], encoding="utf-8")
     assert main(["check", str(damaged), str(log), *known]) == 2

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
 
 import jaximu
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.cli.options import switch, takes_options
+
+if TYPE_CHECKING:
+    from jaximu.ground.page import Page
 
 
 @takes_options
@@ -39,6 +43,11 @@ class CheckCommand(options.Fits):
         recordings, known = self.log.alike(old).read_unit(self.logs, gravity, self.noise)
         with progress("checking"):
             validity = jaximu.check(old, recordings, gravity, static=known, segmentation=self.poses.value())
-        self.results.present(validity.summary, "check.json and report.html", check=validity)
+
+        def page() -> Page:
+            content = validity.summary()
+            return replace(content, next=options.with_paths(content.next, {"calibration": self.calibration}))
+
+        self.results.present(page, "check.json and report.html", check=validity)
         if self.fail_on == "invalid" and validity.verdict not in ("valid", "session"):
             raise SystemExit(1)

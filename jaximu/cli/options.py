@@ -423,14 +423,7 @@ class Results:
     def filled(self, text: str, names: Iterable[str]) -> str:
         """Return a next command with the paths of the documents that are written; `names`: theirs, in small letters."""
         folder = self.output
-        if folder is None:
-            return text
-
-        def file(match: re.Match[str]) -> str:
-            name = match[0].lower()
-            return shlex.quote(str(folder / f"{name}.json")) if name in names else match[0]
-
-        return _PLACEHOLDER.sub(file, text)
+        return text if folder is None else with_paths(text, {name: folder / f"{name}.json" for name in names})
 
     def _write(
         self,
@@ -446,6 +439,16 @@ class Results:
             *write_folder(folder, {name: (text + "\n").encode() for name, text in texts.items()} | dict(files)),
             *draw(lambda: write(folder), folder / "report.html"),
         ]
+
+
+def with_paths(text: str, paths: Mapping[str, Path]) -> str:
+    """Return a next command with the paths of documents that it names in capitals, by their names in small letters."""
+
+    def path(match: re.Match[str]) -> str:
+        name = match[0].lower()
+        return shlex.quote(str(paths[name])) if name in paths else match[0]
+
+    return _PLACEHOLDER.sub(path, text)
 
 
 def typed(group: LogOptions | GravityOptions | NoiseOptions) -> str:
