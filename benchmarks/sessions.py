@@ -100,7 +100,7 @@ def together(folder: Path, units: list[int], figures: dict) -> Table:
         ["unit", "verdict", "named", "χ² per condition, left out in turn", "log-likelihood", "depends on",
          "accelerometer's bias between sessions"],
         "Noise, drift within sessions and the change of the accelerometer's bias between them are estimated from the "
-        "recordings. Steps and ramps belong to one session and are not asked.",
+        "recordings. What belongs to one session, such as a step or a ramp, is asked in that session alone.",
     )  # fmt: skip
     for unit in units:
         paths = [folder / f"unit{unit}_session{session}.parquet" for session in range(1, 5)]

@@ -76,6 +76,13 @@ def test_the_catalogue_is_counted_right():
     assert f"and {causes - 1} other causes" in (ROOT / "README.md").read_text(encoding="utf-8")
 
 
+def test_the_section_on_diagnose_explains_the_options_that_change_its_verdict():
+    guide = (ROOT / "notebooks" / "commands.md").read_text(encoding="utf-8")
+    section = guide.partition("\n## Diagnose\n")[2].partition("\n## ")[0]
+    for option in ("--static", "--heldout", "--latitude", "--by", "--repair"):
+        assert f"`{option}" in section
+
+
 def test_the_citation_names_this_version():
     """And the title, licence and authors that the package states."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
