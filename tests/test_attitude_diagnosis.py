@@ -245,6 +245,20 @@ def test_a_gyroscope_stamped_late_is_found_and_is_not_the_references_delay():
     assert abs(beside["value"] - made.truth["delay"]) < 3 * beside["sigma"] < 1e-3
 
 
+def test_nothing_is_named_or_gained_while_a_mistake_stands():
+    made = moved()
+    kept = np.random.default_rng(3).random(len(made.time)) > 0.01
+    time = made.time[: kept.sum()]
+    lossy = Recording(Signal(time, made.force[kept], "m/s^2"), Signal(time, made.rate[kept], "rad/s"))
+    diagnosis = diagnose_against_attitude(lossy, reference_of(made), GRAVITY)
+    assert {finding.name for finding in diagnosis.preflight if finding.spoils} == {"data.lost_samples"}
+    assert (diagnosis.verdict, diagnosis.effects, diagnosis.gain) == ("unexplained", (), None)
+    (sentence,) = diagnosis.summary().verdict
+    assert sentence.startswith("No effect can be named") and "--repair" in diagnosis.suggestion
+    repaired, _ = calibrate_against_attitude(lossy, reference_of(made), GRAVITY, repair=True)
+    assert repaired.rms["rotation"][1] < 0.8 * diagnosis.calibration.rms["rotation"][1]
+
+
 def test_command(tmp_path, capsys):
     made = moved()
     log, reference = tmp_path / "log.parquet", tmp_path / "tracker.csv"

@@ -17,10 +17,11 @@ import scipy
 
 from jaximu import InputError, LocalGravity, ReadOptions, calibrate, read_recording
 from jaximu.calibration.nominal import nominal_imu
-from jaximu.calibration.recipe import Choices, calibrate_ready
+from jaximu.calibration.recipe import Choices, calibrate_ready, carried_error
 from jaximu.cli.app import main
 from jaximu.diagnosis import diagnose
-from jaximu.mistakes import inspect, prepare
+from jaximu.mistakes import inspect, lost_samples, prepare
+from jaximu.mistakes.base import Samples
 from jaximu.recordings.recording import Recording, Signal
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 1e-6)
@@ -130,6 +131,33 @@ def test_lost_samples_are_counted_with_their_rows():
     assert finding.spoils
     for row in finding.rows:
         assert np.min(np.abs(case.rows + 1 - row)) <= 1
+
+
+@pytest.mark.parametrize("delay", [-6e-3, -3.5e-3, 7e-3])
+def test_a_constant_lag_between_the_sensors_is_no_lost_sample(data_folder, delay):
+    """Motion that is not smooth makes steps of any size: a few near one sample are none that was lost."""
+    path = data_folder / "broad/02_undisturbed_slow_rotation_B.mat"
+    recording = read_recording(path, options=ReadOptions(check=False))
+    gyroscope = recording.gyroscope
+    assert gyroscope is not None
+    late = replace(gyroscope, values=gyroscope.at(gyroscope.time - delay))
+    samples = Samples(replace(recording, gyroscope=late), dict.fromkeys(recording.signals, np.arange(len(late))))
+    assert not lost_samples.find(samples)
+
+
+def test_a_repair_that_fits_worse_is_not_advised():
+    recording = planted("lost_1_percent", 4).log.to_recording()
+
+    def length(tried):
+        return float(np.ptp(tried.gyroscope.time))
+
+    for repair in (False, True):
+        ready = prepare(recording, repair, misfit=length)  # repaired, it is longer
+        assert not ready.findings and len(ready.recording.gyroscope) == len(recording.gyroscope)
+        assert length(ready.recording) == length(recording)
+    choices = Choices(GRAVITY)
+    (finding,) = prepare(recording, misfit=lambda tried: carried_error(tried, choices)).findings
+    assert finding.name == "data.lost_samples"
 
 
 @pytest.mark.parametrize("name", generator.FILES)

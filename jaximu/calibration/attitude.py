@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -26,7 +27,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.tracing import on_host
 from jaximu.ground.vectors import column_lengths, dot_rows, lengths_of, sigmas_of, submatrix
-from jaximu.mistakes import prepared
+from jaximu.mistakes import Prepared, prepared
 from jaximu.model.effects import Effect
 from jaximu.model.effects.reference_delay import SetupReferenceDelay
 from jaximu.model.effects.reference_filter import SetupReferenceFilter
@@ -83,7 +84,7 @@ class _Start:
 
 
 def calibrate_against_attitude(
-    recording: Recording,
+    recording: Recording | Prepared,
     attitude: Attitude,
     gravity: Gravity = STANDARD,
     *,
@@ -108,10 +109,10 @@ def calibrate_against_attitude(
     stands still, moves otherwise than the unit, or determines next to nothing.
     """
     gravity = as_gravity(gravity)
-    if recording.gyroscope is None:
+    if "gyroscope" not in recording.signals:
         raise InputError(f"{recording.name}: a reference attitude calibrates a gyroscope, and there is none.")
     noise = noise_of(static)
-    with prepared([recording], repair) as (ready,):
+    with prepared_against(recording, attitude, repair) as (ready,):
         recording = ready.recording
         start = _coarse(recording, attitude.usable())
         start = replace(start, attitude=_right_handed(recording, start))
@@ -142,6 +143,13 @@ def calibrate_against_attitude(
     notes = (*(finding.text for finding in arrangement(recording, calibration)), *calibration.notes)
     calibration = replace(calibration, notes=tuple(dict.fromkeys(notes)), reference=reference_summary(calibration))
     return calibration, measurement
+
+
+def prepared_against(
+    recording: Recording | Prepared, attitude: Attitude, repair: bool
+) -> AbstractContextManager[tuple[Prepared, ...]]:
+    """Return a recording that was looked over; its repairs are tried by how well it turns as the reference does."""
+    return prepared([recording], repair, misfit=lambda tried: 1 - _coarse(tried, attitude.usable()).explained)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -117,7 +118,9 @@ def calibrate(
         return _calibrated_jointly(by_hand, data, choices, start, repair)
     if start is not None:
         raise InputError("a start is for data of several kinds: recordings by hand begin at the data sheet's values.")
-    with prepared(by_hand, repair, gyroscope=method != "accelerometer") as ready:
+    turned = method != "accelerometer"
+    misfit = partial(carried_error, choices=choices) if turned else None
+    with prepared(by_hand, repair, gyroscope=turned, misfit=misfit) as ready:
         calibration, unusual = calibrate_ready([one.recording for one in ready], choices, repair)
     notes = [*notes_of(*ready), *(item.text for item in unusual)]
     calibration = replace(calibration, notes=tuple(dict.fromkeys((*notes, *calibration.notes))))
@@ -234,6 +237,11 @@ def calibrate_ready(
     if "gravity_direction" in calibration.rms and calibration.gains_determined():
         require_carried(calibration.rms["gravity_direction"][1], ", ".join(one.name for one in recordings))
     return calibration, findings
+
+
+def carried_error(recording: Recording, choices: Choices) -> float:
+    """Return by how much (°, rms) gravity misses the next pose, carried over the turns of a calibrated recording."""
+    return _calibrated([recording], choices).rms["gravity_direction"][1]
 
 
 def _of_a_vehicle(recording: Recording) -> str:

@@ -182,7 +182,12 @@ def describe(
     from jaximu.mistakes import prepare
     from jaximu.report.recording import signal_facts
 
-    ready = prepare(recording)
+    def misfit(tried: Recording) -> float:
+        from jaximu.calibration.recipe import Choices, carried_error  # only where a repair is to be tried
+
+        return carried_error(tried, Choices())
+
+    ready = prepare(recording, misfit=misfit)
     used, guessed = ready.recording.signals, guessed or []
     signals = {name: signal_facts(signal, used[name]) for name, signal in recording.signals.items()}
     guessing = guessed or advice is not None

@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import partial
 
 from jaximu.calibration import calibrate_against_attitude
+from jaximu.calibration.attitude import prepared_against
 from jaximu.diagnosis.diagnosis import Diagnosis, diagnose_data
 from jaximu.ground.gravity import STANDARD, Gravity
-from jaximu.mistakes import inspect
 from jaximu.model.noise_model import NoiseModel
 from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.attitude import Attitude
@@ -31,15 +31,15 @@ def diagnose_against_attitude(
     What explains the misfit is taken out of the noise, and the rest is asked again. Raises what these two raise.
     """
     known = noise_of(static)
-    calibrated = partial(calibrate_against_attitude, recording, attitude, gravity, static=known, repair=repair)
-    calibration, measurement = calibrated()
-    noise = known or measurement.white_noise(calibration.excess)
-    return diagnose_data(
-        calibration,
-        measurement,
-        noise,
-        lambda effects: calibrated(effects=effects)[0],
-        findings=tuple(inspect(recording)),
-        notes=calibration.notes,
-        level=level,
-    )
+    with prepared_against(recording, attitude, repair) as (ready,):
+        calibrated = partial(calibrate_against_attitude, ready, attitude, gravity, static=known)
+        calibration, measurement = calibrated()
+        return diagnose_data(
+            calibration,
+            measurement,
+            known or measurement.white_noise(calibration.excess),
+            lambda effects: calibrated(effects=effects)[0],
+            findings=ready.findings,
+            notes=calibration.notes,
+            level=level,
+        )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -14,7 +15,7 @@ from jaximu.calibration.arrangement import axes_unlike
 from jaximu.calibration.calibration import provenance, require_another, require_calibration
 from jaximu.calibration.filter_history import History
 from jaximu.calibration.in_use import INTERVAL, FilterInUse, follow
-from jaximu.calibration.recipe import Choices, calibrate_ready, require_gravity
+from jaximu.calibration.recipe import Choices, calibrate_ready, carried_error, require_gravity
 from jaximu.calibration.systematic import noise_at_rest
 from jaximu.data.by_hand import RecordedByHand
 from jaximu.diagnosis.comparison import (
@@ -116,8 +117,9 @@ def check(
     require_another(calibration, [source.sha256 for recording in several for source in recording.sources])
     if data is not None:
         return _compared(calibration, Old.of(calibration, gravity, data.free), data, noise, level)
-    with prepared(several) as ready:
-        validity = _checked(calibration, [one.recording for one in ready], gravity, noise, segmentation, level)
+    choices = Choices(gravity, noise, segmentation)
+    with prepared(several, misfit=partial(carried_error, choices=choices)) as ready:
+        validity = _checked(calibration, [one.recording for one in ready], choices, level)
         if validity.verdict != "valid" and any(one.spoiling for one in ready):
             raise NotPossibleError("this recording cannot show whether the calibration is still valid.")
     notes = [note for one in ready for note in one.notes]
@@ -127,16 +129,15 @@ def check(
 def _checked(
     calibration: Calibration,
     recordings: Sequence[Recording],
-    gravity: LocalGravity,
-    noise: NoiseModel | None,
-    segmentation: SegmentationOptions | None,
+    choices: Choices,
     level: float,
 ) -> Validity:
     """Compare with recordings that were looked over: by their poses, or by a filter where there are too few."""
+    gravity, noise = choices.gravity, noise_of(choices.static)
     old = Old.of(calibration, gravity)
-    recordings, findings, known = _as_fitted_anew(recordings, Choices(gravity, noise, segmentation))
+    recordings, findings, known = _as_fitted_anew(recordings, choices)
     try:
-        parts = tuple(segment(recording, segmentation) for recording in recordings)
+        parts = tuple(segment(recording, choices.segmentation) for recording in recordings)
         if len(recordings) == 1 and len(parts[0].intervals) < _FEWEST_POSES:
             raise NotPossibleError(
                 f"{recordings[0].name} has two poses and no motion between them to check anything by."

@@ -14,7 +14,7 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.calibration.bias_drift import with_gravity
 from jaximu.calibration.calibration import clock_sigma, concluded
-from jaximu.calibration.recipe import Choices, calibrate, calibrate_ready
+from jaximu.calibration.recipe import Choices, calibrate, calibrate_ready, carried_error
 from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.drift import about_biases, with_usual_drift
 from jaximu.diagnosis.checks import Check, checks_of
@@ -402,11 +402,9 @@ def diagnose(
             "a diagnosis needs accelerometer and gyroscope: the turns between poses tell most causes apart."
         )
     choices = Choices(gravity, segmentation=segmentation)
-    with prepared(recordings, repair) as ready:
+    with prepared(recordings, repair, misfit=partial(carried_error, choices=choices)) as ready:
         findings = [finding for one in ready for finding in one.findings]
-        spoiling = [finding for one in ready for finding in one.spoiling]
         calibration, unusual = calibrate_ready([one.recording for one in ready], choices, repair)
-        spoiling += [finding for finding in unusual if finding.spoils]
         notes, held = [*calibration.notes, *_only(names)], None
         if heldout is not None:
             other, _ = calibrate_ready([prepare(heldout, repair).recording], choices, repair)
@@ -426,17 +424,13 @@ def diagnose(
                 tuple(known),
                 findings=(*findings, *unusual),
                 level=level,
-                naming=not spoiling,
             )
             return examine(examination)
 
         diagnosis, before = examined(data), None
         if swings := swings_of(data.segmentations, lines):
             diagnosis, before = examined(data.without_swings(swings)), diagnosis
-        diagnosis = _with_lines(diagnosis, before, lines)
-    if diagnosis.verdict != "adequate" and not spoiling:  # what a repair could not find may look like an effect
-        spoiling = [finding for finding in findings if finding.partial]
-    return without_effects(diagnosis, spoiling) if spoiling else diagnosis
+        return _with_lines(diagnosis, before, lines)
 
 
 def _with_lines(diagnosis: Diagnosis, before: Diagnosis | None, lines: tuple[MovingLine, ...]) -> Diagnosis:
@@ -538,9 +532,8 @@ class Examination:
     remade: makes the experiment, the calibrated recording, with a noise model; held: the same of another recording of
     the unit, to measure the gain on. findings, notes: what was found before. level: rate of false alarms over all tests
     together. drifting: the noise was taken from the recording and knows no drift, which is estimated. trusted: the
-    noise is not asked. naming: false where a mistake in the recording stands, and what it imitates need not be looked
-    for. taken: effects that another selection has chosen, which are named and kept. measured: how the gain is measured
-    without another recording, where not by selecting anew without parts of this one.
+    noise is not asked. taken: effects that another selection has chosen, which are named and kept. measured: how the
+    gain is measured without another recording, where not by selecting anew without parts of this one.
     """
 
     calibration: Calibration
@@ -552,7 +545,6 @@ class Examination:
     level: float = 0.05
     drifting: bool = False
     trusted: bool = False
-    naming: bool = True
     taken: tuple[Effect, ...] = ()
     measured: Callable[[Experiment, State, State], Gain] | None = None
 
@@ -585,6 +577,11 @@ class Examination:
         other = None if held is None else partial(remade, held)
         return cls(calibration, noise, partial(remade, data), other, notes=notes, **about)
 
+    @property
+    def naming(self) -> bool:
+        """Whether effects are looked for: not while a mistake in the recording stands that imitates them."""
+        return not any(finding.spoils for finding in self.findings)
+
     @cached_property
     def first(self) -> tuple[Experiment, State]:
         """The recording with the noise as it is before it is asked, usual drift in it where it knows none; its fit.
@@ -604,8 +601,18 @@ class Examination:
 def examine(examination: Examination) -> Diagnosis:
     """Ask a recording, of whatever kind, for everything that its calibration lacks, extend the model, measure the gain.
 
-    Raises `NotPossibleError` where too little is left to ask anything.
+    No effect is named while a mistake in the recording stands that could imitate it. Raises `NotPossibleError` where
+    too little is left to ask anything.
     """
+    diagnosis = _of_instants_too(examination)
+    spoiling = [finding for finding in examination.findings if finding.spoils]
+    if diagnosis.verdict != "adequate" and not spoiling:  # what a repair could not find may look like an effect
+        spoiling = [finding for finding in examination.findings if finding.partial]
+    return _without_effects(diagnosis, spoiling) if spoiling else diagnosis
+
+
+def _of_instants_too(examination: Examination) -> Diagnosis:
+    """Ask once more, as samples of instants, where the recording is better explained so."""
     diagnosis = _examined(examination)
     coarse = any(finding.name == "data.sampling" for finding in diagnosis.preflight)
     if not examination.naming or (
@@ -907,7 +914,7 @@ def _require_freedom(base: State, calibration: Calibration) -> None:
         )
 
 
-def without_effects(diagnosis: Diagnosis, spoiling: Sequence[Finding]) -> Diagnosis:
+def _without_effects(diagnosis: Diagnosis, spoiling: Sequence[Finding]) -> Diagnosis:
     """Return the diagnosis of a recording with mistakes that stand: what they imitate is not named."""
     options = list(dict.fromkeys(finding.repair for finding in spoiling if finding.repair and finding.spoils))
     names = ", ".join(dict.fromkeys(effect_title(finding.name) for finding in spoiling))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from jaximu.calibration import Calibration
 from jaximu.calibration.turntable import calibrate_table_ready
 from jaximu.data.recorded_stations import RecordedStations
-from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine, same_device, without_effects
+from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine, same_device
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.mistakes import Prepared, prepare, prepared
@@ -36,8 +36,7 @@ def diagnose_turntable(
     No effect is named while a mistake in the recording stands that could imitate it. Raises what these two raise.
     """
     with prepared([recording], repair) as (ready,):
-        diagnosis = _of_ready(ready, reference, as_gravity(gravity), noise_of(static), heldout, level, repair)
-    return without_effects(diagnosis, ready.spoiling) if ready.spoiling else diagnosis
+        return _of_ready(ready, reference, as_gravity(gravity), noise_of(static), heldout, level, repair)
 
 
 def _of_ready(
@@ -57,11 +56,7 @@ def _of_ready(
     if heldout is not None:
         other, held = _on_table(prepare(heldout[0], repair), heldout[1], gravity)
         notes = (*notes, *same_device(calibration, other))
-    return examine(
-        Examination.of(
-            calibration, data, noise, held, findings=ready.findings, notes=notes, level=level, naming=not ready.spoiling
-        )
-    )
+    return examine(Examination.of(calibration, data, noise, held, findings=ready.findings, notes=notes, level=level))
 
 
 def _on_table(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import pyarrow as pa
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration import nominal_imu, require_carried, require_spanning
 from jaximu.calibration.arrangement import unusual_gains
+from jaximu.calibration.recipe import Choices, carried_error
 from jaximu.data.poses import EXCESS_NAMES
 from jaximu.estimation.fitting import Fit
 from jaximu.estimation.problem import flatten, names_of, without_equipment
@@ -150,7 +151,8 @@ def read_job(job: Job, settings: Settings) -> ReadJob:
         options, gyro_log = settings.reading(job)
         recording = read_recording(job.file, gyro_log, options)
         noise = _noise(job.static, options) if job.static else None
-        with prepared([recording]) as (ready,):
+        choices = Choices(settings.gravity, noise, settings.segmentation)
+        with prepared([recording], misfit=partial(carried_error, choices=choices)) as (ready,):
             segmentation = segment(ready.recording, settings.segmentation)
             unit, notes = _unit(ready.recording, segmentation, settings, noise)
     except Exception as error:

@@ -220,7 +220,13 @@ def _losses(samples: Samples, wanted: Rows, half: int) -> _Losses | None:
         often = np.sum(lost[wanted] > 0) / max(int(clear.sum()), 1)
         sure = np.clip(np.log((1 - often) / max(often, 1e-6)) + 5.0, 7.0, _SURE)
         least = 2.6 * sure
-    return _Losses(lost, clear, power, step) if np.sum(lost > 0) >= _FEWEST else None
+    # motion that is not smooth enough makes steps of any size in the other intervals, too
+    missing, places = lost[wanted], lost[wanted] > 0
+    if np.sum(places) < _FEWEST:
+        return None
+    scatter = np.mean((product**2 / np.maximum(power, 1e-300))[clear & ~places]) if (clear & ~places).any() else 1.0
+    gains = (2 * missing * product - missing**2 * power)[places] / 2
+    return _Losses(lost, clear, power, step) if np.median(gains) > _SURE * max(scatter, 1.0) else None
 
 
 def _singles(samples: Samples) -> list[Finding]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -108,11 +108,17 @@ def inspect(recording: Recording) -> list[Finding]:
     return list(prepare(recording).findings)
 
 
-def prepare(recording: Recording, repair: bool = False, magnetometer: bool = False) -> Prepared:
+def prepare(
+    recording: Recording,
+    repair: bool = False,
+    magnetometer: bool = False,
+    misfit: Callable[[Recording], float] | None = None,
+) -> Prepared:
     """Leave out what is no measurement, and with `repair` change what can be put right; look again until nothing comes.
 
     Each kind of mistake of a sensor is handled once, in at most four rounds. `magnetometer`: look at the magnetometer's
-    samples, and not at the other sensors'.
+    samples, and not at the other sensors'. `misfit`: what a fit leaves of a recording; what looks like a mistake that
+    spoils it, and whose repair fits worse, is none.
     """
     findings = [Finding(note.name, (), str(note)) for note in recording.notes if isinstance(note, Defect)]
     origin: dict[str, Rows] = {name: np.arange(len(signal)) for name, signal in recording.signals.items()}
@@ -130,6 +136,8 @@ def prepare(recording: Recording, repair: bool = False, magnetometer: bool = Fal
             if _repeats(finding, findings):
                 continue
             handled.add((finding.name, _subject(finding)))
+            if misfit is not None and finding.spoils and finding.repair and _fits_worse(recording, finding, misfit):
+                continue
             if finding.apply is not None and (repair or not finding.repair):
                 recording = finding.apply(recording)
                 changed = True
@@ -166,16 +174,17 @@ def prepared(
     gyroscope: bool = True,
     magnetometer: bool = False,
     gravity: bool = True,
+    misfit: Callable[[Recording], float] | None = None,
 ) -> Iterator[tuple[Prepared, ...]]:
     """Make recordings ready; an error on the way begins with the mistake found in them, which is the likelier cause.
 
     One that was looked over is taken as it is.
-    `gyroscope`, `gravity`: whether they are needed. Raises InputError where what is needed is not there, with the
-    finding's own sentence.
+    `gyroscope`, `gravity`: whether they are needed; `misfit` as for `prepare`. Raises InputError where what is needed
+    is not there, with the finding's own sentence.
     """
     unneeded = {name for name, needed in (("gyroscope", gyroscope), ("gravity", gravity)) if not needed}
     ready = tuple(
-        recording if isinstance(recording, Prepared) else prepare(recording, repair, magnetometer)
+        recording if isinstance(recording, Prepared) else prepare(recording, repair, magnetometer, misfit)
         for recording in recordings
     )
     for one in ready:
@@ -199,6 +208,17 @@ def prepared(
         texts = {finding.name: f"{finding.text} ({finding.name})" for finding in reversed(standing)}
         reason = str(error) if isinstance(error, JaximuError) else "nothing can be estimated from it."
         raise NotPossibleError(f"{' '.join(list(texts.values())[::-1][:3])} Hence: {reason}") from error
+
+
+def _fits_worse(recording: Recording, finding: Finding, misfit: Callable[[Recording], float]) -> bool:
+    """Whether a recording fits worse once a finding is repaired; one that cannot be fitted fits worst."""
+    misfits = []
+    for tried in (recording, recording if finding.apply is None else finding.apply(recording)):
+        try:
+            misfits.append(misfit(tried))
+        except JaximuError:
+            misfits.append(np.inf)
+    return misfits[1] > misfits[0]
 
 
 def _leaves_out_much(ready: Prepared, finding: Finding) -> bool:
