@@ -13,6 +13,7 @@ from jaximu.diagnosis.attribution import attributed, split
 from jaximu.diagnosis.lines import MOVING_LINE
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model.effects import CATALOGUE
+from jaximu.recordings import write_recording
 from jaximu.report.html import write_report
 
 UNITS, SESSIONS = 4, 3
@@ -198,6 +199,54 @@ def test_patterns_of_names_and_folders(pattern, files, places):
 def test_patterns_that_do_not_fit_name_the_file(pattern, files, error, words):
     with pytest.raises(error, match=words):
         places_of(files, pattern)
+
+
+def listing(folder, header, *rows):
+    """A list of the logs of two units in two sessions, as a spreadsheet has it."""
+    for recording in board(1, 2, 2, {}, [], poses=3):
+        write_recording(recording, folder / recording.sources[0].path)
+    path = folder / "table.csv"
+    path.write_text("\n".join([header, *rows]), encoding="utf-8")
+    return str(path)
+
+
+LISTED = ["1,1,unit1_session1.csv", "1,2,unit1_session2.csv", "B,1,unit2_session1.csv", "B,2,unit2_session2.csv"]
+
+
+@pytest.mark.parametrize(
+    ("header", "rows", "options", "units"),
+    [
+        ("unit,session,file", LISTED, [], "11BB"),
+        ("device,session,file", LISTED, [], "11BB"),
+        ("device,lot,file", LISTED, ["--by", PATTERN], "1122"),
+    ],
+)
+def test_a_table_names_the_recordings_of_units_and_sessions(header, rows, options, units, tmp_path, monkeypatch):
+    asked = []
+
+    def stand_in(recordings, *, places, **others):
+        asked.extend(zip((recording.sources[0].path for recording in recordings), places, strict=True))
+        raise NotPossibleError("enough.")
+
+    monkeypatch.setattr("jaximu.diagnosis.attribution.attribute", stand_in)
+    monkeypatch.setattr("jaximu.diagnosis.attribute", stand_in, raising=False)
+    assert main(["diagnose", listing(tmp_path, header, *rows), *options]) == 1
+    assert [unit for _, (unit, _) in asked] == [*units] and [session for _, (_, session) in asked] == [*"1212"]
+    assert [path.rpartition("/")[2] for path, _ in asked] == [row.split(",")[2] for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("header", "rows", "options", "status", "words"),
+    [
+        ("unit,session,file", [*LISTED[:3], "B,,unit2_session2.csv"], [], 2, "has no session"),
+        ("unit,session,file", [*LISTED[:3], "B,1,unit2_session2.csv"], [], 2, "both unit B in session 1"),
+        ("unit,session,file", LISTED[:2], [], 1, "1 unit in 2 sessions"),
+        ("unit,session,file", LISTED, ["--thermal"], 2, "leave --thermal out"),
+    ],
+)
+def test_a_table_that_cannot_be_split_says_why(header, rows, options, status, words, tmp_path, capsys):
+    assert main(["diagnose", listing(tmp_path, header, *rows), *options]) == status
+    assert words in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

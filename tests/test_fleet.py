@@ -26,7 +26,7 @@ from jaximu.data import residual_rms
 from jaximu.data.poses import PosesAndTurns
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.problem import flatten, names_of, without_equipment
-from jaximu.fleets import FleetUnit, Job, Settings, find_jobs, fit_units, rows_of, run_fleet
+from jaximu.fleets import FleetUnit, Job, Settings, find_jobs, fit_units, listed_jobs, rows_of, run_fleet
 from jaximu.fleets import engines as engines_module
 from jaximu.fleets.population import read_fleet
 from jaximu.fleets.store import Store
@@ -288,6 +288,27 @@ def test_manifests_that_are_refused(tmp_path, capsys, content, message):
     printed = capsys.readouterr()
     assert message in printed.err and len(printed.err.splitlines()) == 1
     assert not list(tmp_path.glob("t.parquet*"))
+
+
+def test_units_and_sessions_go_into_the_table_and_from_it_to_a_diagnosis(folder, tmp_path, capsys):
+    """The page has no time courses; it names the command that asks for what a session has in common."""
+    logs = [os.path.relpath(path, tmp_path) for path in sorted(folder.glob("unit00[1-4].parquet"))]
+    places = [("A", "1"), ("A", "2"), ("B", "1"), ("B", "2")]
+    rows = [f"{unit},{session},{log},--stamp header" for (unit, session), log in zip(places, logs, strict=True)]
+    (tmp_path / "list.csv").write_text("\n".join(["unit,session,file,options", *rows]), encoding="utf-8")
+    output = tmp_path / "fleet.parquet"
+    arguments = [str(tmp_path / "list.csv"), "-o", str(output), "--latitude", "48.1", "--axes", "x,y,z"]
+    assert main(["fleet", *arguments, "--workers", "1"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert f"`jaximu diagnose {output} --latitude 48.1 -o RESULTS`" in printed and "session.common_drift" in printed
+    table = pq.read_table(output).to_pylist()
+    assert [(row["device"], row["unit"], row["session"]) for row in table] == [(u, u, s) for u, s in places]
+    listed = {name: listed_jobs(path) for name, path in (("list", tmp_path / "list.csv"), ("table", output))}
+    for jobs in listed.values():
+        assert [(job.unit, job.session) for job in jobs] == places
+        assert [Path(job.file).resolve() for job in jobs] == [(tmp_path / log).resolve() for log in logs]
+    assert dict(listed["table"][0].options) == {"stamp": "header", "axes": "x,y,z"}
+    assert listed_jobs(folder / "unit001.parquet") is None
 
 
 def test_usage_that_is_refused(folder, tmp_path, capsys):

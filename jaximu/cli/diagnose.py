@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,6 +15,7 @@ from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.diagnosis import Diagnosis
+    from jaximu.fleets import Job
 
 
 @takes_options
@@ -23,7 +25,8 @@ class DiagnoseCommand(options.Fits):
     Several LOGs are several recordings of one unit, each with its own biases: what the unit does in all of them shows
     together where one hardly shows it, and drift is tested in each by itself. DIR receives diagnosis.json, the
     extended calibration.json, report.html and pictures. With --by they are recordings of several units: DIR receives
-    diagnosis.json and report.html.
+    diagnosis.json and report.html. A manifest or a table of jaximu fleet with the columns session and unit (or device)
+    in place of LOGS names them as well.
 
     Examples:
       jaximu diagnose log.csv --static rest.csv -o results
@@ -32,6 +35,7 @@ class DiagnoseCommand(options.Fits):
       jaximu diagnose log.csv --reference tracker.csv
       jaximu diagnose oven.csv --thermal
       jaximu diagnose logs/*.csv --by 'unit{unit}_session{session}' -o results
+      jaximu diagnose fleet.parquet -o results
 
     """
 
@@ -57,10 +61,11 @@ class DiagnoseCommand(options.Fits):
 
     def run(self) -> None:
         """Do what the command line says."""
+        jobs = self._jobs()
         gravity, measured = self.local.value(), self._measured()
-        self.results.prepare(*(options.INERTIAL if self.by is None else ()))
-        if self.by is not None:
-            return self._attribute(self.by, gravity)
+        self.results.prepare(*(options.INERTIAL if jobs is None else ()))
+        if jobs is not None:
+            return self._attribute(jobs, gravity)
         recordings, known = self.log.read_unit(self.logs, gravity, self.noise)
         other = None if self.heldout is None else self.log.read(self.heldout, gravity)
         from jaximu.diagnosis import diagnose, diagnose_against_attitude, diagnose_thermal, diagnose_turntable
@@ -105,9 +110,6 @@ class DiagnoseCommand(options.Fits):
             raise InputError("--thermal is for recordings at rest, --reference for poses and turns: give one of them.")
         if self.reference is not None and len(self.logs) != 1:
             raise InputError(f"--reference goes with one LOG, found {len(self.logs)}.")
-        others = {"--thermal": self.thermal, "--reference": self.reference, "--heldout": self.heldout}
-        if self.by is not None and (stated := [name for name, value in others.items() if value]):
-            raise InputError(f"--by compares recordings with each other: leave {stated[0]} out.")
         options.require_files(self.reference)
         from jaximu.recordings.readers import holds_attitude
 
@@ -120,19 +122,52 @@ class DiagnoseCommand(options.Fits):
             raise InputError("--heldout-reference goes with --reference.")
         return measured
 
-    def _attribute(self, pattern: str, gravity: jaximu.LocalGravity) -> None:
-        """Tell what belongs to a unit, to a session or to all."""
-        from jaximu.diagnosis import attribute, places_of
+    def _jobs(self) -> list[Job] | None:
+        """Return recordings of several units and sessions: those that a table lists, or LOGS with --by; else None."""
+        options.require_files(*self.logs)
+        from jaximu.fleets import Job, listed_jobs
 
-        places_of(list(map(str, self.logs)), pattern)
-        recordings, known = self.log.read_unit(self.logs, gravity, self.noise)
+        listed = listed_jobs(self.logs[0]) if len(self.logs) == 1 else None
+        if listed is None and self.by is None:
+            return None
+        others = {"--thermal": self.thermal, "--reference": self.reference, "--heldout": self.heldout}
+        if stated := [name for name, value in others.items() if value]:
+            raise InputError(f"recordings of several units are compared with each other: leave {stated[0]} out.")
+        jobs = [Job("", str(path)) for path in self.logs] if listed is None else listed
+        from jaximu.diagnosis.attribution import places_of, require_apart
+
+        files = [job.file for job in jobs]
+        if self.by is not None:
+            places = places_of(files, self.by)
+        elif lacking := [job.file for job in jobs if not (job.unit or job.device) or not job.session]:
+            raise InputError(f"{self.logs[0]}: {lacking[0]} has no session: fill the column, or state --by PATTERN.")
+        else:
+            places = require_apart(files, [(job.unit or job.device, job.session) for job in jobs])
+        return [replace(job, unit=unit, session=session) for job, (unit, session) in zip(jobs, places, strict=True)]
+
+    def _attribute(self, jobs: list[Job], gravity: jaximu.LocalGravity) -> None:
+        """Tell what belongs to a unit, to a session or to all."""
+        from jaximu.diagnosis import attribute
+        from jaximu.fleets.rows import noise_at_rest
+
+        logs = [self.log.restated(job.options) for job in jobs]
+        if len(jobs) == len(self.logs):
+            recordings, known = self.log.read_unit(self.logs, gravity, self.noise)
+        else:
+            with progress("reading"):
+                recordings = [log.read(Path(job.file), gravity) for log, job in zip(logs, jobs, strict=True)]
+                known = self.noise.value(self.log, gravity)
+        statics = [
+            noise_at_rest(job.static, replace(log, gyro_log=None).reading(gravity)) if job.static else known
+            for log, job in zip(logs, jobs, strict=True)
+        ]
         with progress("diagnosing", every=0.0) as report:
             attribution = attribute(
                 recordings,
-                pattern,
-                gravity,
+                gravity=gravity,
+                places=[(job.unit, job.session) for job in jobs],
+                statics=statics,
                 report=report,
-                static=known,
                 segmentation=self.poses.value(),
                 repair=self.repair,
             )

@@ -37,8 +37,9 @@ class FleetCommand:
 
     A magnetometer in a log gets its hard and soft iron from the rests; --field states the strength where all were.
 
-    A manifest (CSV) has the columns device and file, and optionally date, lot, static (a recording of the device at
-    rest) and options (such as --rate 100). A recording that fails costs only its own row; a run that was stopped
+    A manifest (CSV) has the columns device (or unit) and file, and optionally session, date, lot, static (a recording
+    of the device at rest) and options (such as --rate 100). With sessions, jaximu diagnose TABLE.parquet says what
+    belongs to which unit and session. A recording that fails costs only its own row; a run that was stopped
     resumes. Beside the table, TABLE.html shows the population, units that do not belong, and differences between lots
     and dates; TABLE.json holds the same, and TABLE.shrunk.parquet has each unit with the population as prior.
 
@@ -90,7 +91,7 @@ class FleetCommand:
 
         with progress("questioning the fleet"):
             fleet = read_fleet(output)
-        page, html = page_of(fleet, field_words(output)), output.with_suffix(".html")
+        page, html = page_of(fleet, field_words(output), options.typed(self.local)), output.with_suffix(".html")
         written = options.draw(lambda: _write(fleet, page, output), html)
         line = None
         if held is not None and statuses["ok"]:
@@ -139,7 +140,7 @@ class FleetCommand:
         from jaximu.fleets import Settings
 
         return Settings(
-            options=tuple(sorted((name, str(value)) for name, value in vars(self.log).items() if value is not None)),
+            options=self.log.stated(),
             gravity=self.local.value(),
             diagnose=self.diagnose,
             segmentation=self.poses.value(),

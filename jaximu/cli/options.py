@@ -175,6 +175,15 @@ class LogOptions:
                 say(f"{path} is read as the calibrated log was:{taken}.")
         return recording
 
+    def stated(self) -> tuple[tuple[str, str], ...]:
+        """Return the options that were given, by name, as a fleet's jobs have them."""
+        return tuple(sorted((name, str(value)) for name, value in vars(self).items() if value is not None))
+
+    def restated(self, stated: Iterable[tuple[str, str]]) -> LogOptions:
+        """Return the options with others in their place, by name, as a fleet's jobs have them."""
+        kinds = {"gyro_log": Path, "rate": float, "instance": int}
+        return replace(self, **{name: kinds.get(name, str)(value) for name, value in stated})
+
     def reading(self, gravity: LocalGravity = STANDARD, check: bool = True, alone: bool = False) -> jaximu.ReadOptions:
         """Return what the library asks for."""
         stated = {name: value for name, value in vars(self).items() if name != "gyro_log"}

@@ -605,28 +605,35 @@ def places_of(files: Sequence[str], pattern: str) -> list[tuple[str, str]]:
     parts = re.split(r"(\{(?:unit|session)\})", pattern)
     fields = {f"{{{name}}}": f"(?P<{name}>[^/]+?)" for name in names}
     shape = re.compile("(?:.*/)?" + "".join(fields.get(part) or re.escape(part) for part in parts) + r"(?:\.[^/]*)?")
-    places: dict[tuple[str, str], str] = {}
+    places: list[tuple[str, str]] = []
     strangers = []
     for file in files:
         path = PurePath(file)
         match = next(filter(None, (shape.fullmatch(folder.as_posix()) for folder in (path, *path.parents))), None)
         if match is None:
             strangers.append(file)
-            continue
-        owner = match["unit"], match["session"]
-        if owner in places:
-            raise InputError(
-                f"--by {pattern!r}: {places[owner]} and {file} are both unit {owner[0]} in session {owner[1]}. Leave "
-                "one out, or let the pattern tell them apart."
-            )
-        places[owner] = file
+        else:
+            places.append((match["unit"], match["session"]))
     if strangers:
         more = f" and {len(strangers) - 1} more" if len(strangers) > 1 else ""
         raise InputError(
             f"--by {pattern!r} does not fit {strangers[0]}{more}: it is to fit the name or folder of every LOG."
         )
-    require_several(places)
-    return list(places)
+    return require_apart(files, places)
+
+
+def require_apart(files: Sequence[str], places: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Return the unit and session of each file. Raises `InputError` where two are of one, else as `require_several`."""
+    owners: dict[tuple[str, str], str] = {}
+    for file, owner in zip(files, places, strict=True):
+        if owner in owners:
+            raise InputError(
+                f"{owners[owner]} and {file} are both unit {owner[0]} in session {owner[1]}. Leave one out, or let the "
+                "pattern or the table tell them apart."
+            )
+        owners[owner] = file
+    require_several(owners)
+    return list(owners)
 
 
 def require_several(places: Iterable[tuple[str, str]], why: str = "") -> None:
@@ -641,9 +648,11 @@ def require_several(places: Iterable[tuple[str, str]], why: str = "") -> None:
 
 def attribute(
     recordings: Sequence[Recording],
-    pattern: str,
+    pattern: str = "",
     gravity: Gravity = STANDARD,
     *,
+    places: Sequence[tuple[str, str]] = (),
+    statics: Sequence[Any] = (),
     level: float = 0.05,
     report: Callable[[str], None] = lambda text: None,
     **options: Any,
@@ -654,21 +663,23 @@ def attribute(
     and they are diagnosed once more. What stays unexplained is diagnosed with what the other recordings say of its
     unit's own effects taken off. Each recording keeps the diagnosis that explains it with fewer effects.
 
-    **Arguments:** `pattern`: of their files, see `places_of`; `level`: of all attributions together where nothing
-    belongs to anything; `report`: is given each step in words; `options`: as for [`jaximu.diagnose`][].
+    **Arguments:** `pattern`: of their files, see `places_of`; `places`: the unit and session of each instead;
+    `statics`: a recording at rest of each, or its noise, where there is one; `level`: of all attributions together
+    where nothing belongs to anything; `report`: is given each step in words; `options`: as for [`jaximu.diagnose`][].
 
     Recordings that cannot be diagnosed are skipped. Raises `InputError` and `NotPossibleError` as `places_of` does, and
     `InputError` as `jaximu.diagnose` does.
     """
     recordings, gravity = recordings_of(list(recordings)), as_gravity(gravity)
     files = [recording.sources[0].path if recording.sources else recording.name for recording in recordings]
-    places, skipped = places_of(files, pattern), {}
+    places, skipped = require_apart(files, places) if places else places_of(files, pattern), {}
+    own = [{"static": static} if static is not None else {} for static in statics] or [{}] * len(recordings)
 
     def ask(index: int, recording: Recording, what: str, known: Sequence[KnownEffect] = ()) -> BoardRecording | None:
         unit, session = places[index]
         report(f"unit {unit} in session {session}{what}, {index + 1} of {len(recordings)}")
         try:
-            diagnosis = diagnose(recording, gravity, level=level, known=known, **options)
+            diagnosis = diagnose(recording, gravity, level=level, known=known, **options | own[index])
         except NotPossibleError as error:
             skipped[files[index] + what] = str(error)
             return None

@@ -15,6 +15,9 @@ from dataclasses import asdict, dataclass, fields, replace
 from importlib import import_module
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
+
 from jaximu._version import __version__
 from jaximu.ground.document import Json, file_digest
 from jaximu.ground.errors import FilePath, InputError, only, readable
@@ -32,7 +35,7 @@ ONE_THREAD: dict[str, str] = dict.fromkeys(
 PATIENCE = 1.0
 """Seconds without a row after which an engine gives an empty batch, so that its caller can say what it waits for."""
 
-_COLUMNS = ("device", "file", "date", "lot", "station", "static", "options")
+_COLUMNS = ("device", "file", "date", "lot", "unit", "session", "station", "static", "options")
 _ALL = ""  # no device is called so
 _NUMBERS = {"rate": float, "instance": int}
 _OPTIONS = tuple(option.name for option in fields(ReadOptions) if option.name not in ("gravity", "check"))
@@ -40,7 +43,7 @@ _OPTIONS = tuple(option.name for option in fields(ReadOptions) if option.name no
 
 @dataclass(frozen=True)
 class Job:
-    """One recording of one device. date, lot, station: for the fleet's statistics.
+    """One recording of one device. date, lot, station: for the fleet's statistics. unit, session: of a board's.
 
     options: how to read it, as (name, value). static: a recording at rest, which tells the noise; ""
     where there is none. copy_of: the file, of another job, that has the same bytes; "" where there is none.
@@ -54,6 +57,8 @@ class Job:
     static: str = ""
     station: str = ""
     copy_of: str = ""
+    unit: str = ""
+    session: str = ""
 
 
 @dataclass(frozen=True)
@@ -130,9 +135,9 @@ def find_jobs(
     """Return the jobs that logs, folders, patterns and manifests name, in a fixed order.
 
     A folder gives all logs below it, and a device is called after its file: the name without its suffix, or as much of
-    the path as tells it from the others. A manifest is a CSV file with the columns `device` and `file` (as from the
-    manifest's folder), and if wanted `date`, `lot`, `station`, `static` and `options` (such as `--rate 100 --axes
-    FRD`). `output` is never taken for a log, nor is a recording at rest. `static`: one recording at rest for all whose
+    the path as tells it from the others. A manifest is a CSV file with the columns `device` (or `unit`) and `file` (as
+    from the manifest's folder), and if wanted `session`, `date`, `lot`, `station`, `static` and `options` (such as
+    `--rate 100 --axes FRD`). `output` is never taken for a log, nor is a recording at rest. `static`: one for all whose
     manifest names none, or a folder of them, each called after its device. Raises `InputError` where nothing is found
     or a recording is named twice.
     """
@@ -156,7 +161,7 @@ def find_jobs(
                 raise InputError(f"{argument}: the folder holds no logs (files ending in {', '.join(SUFFIXES)}).")
             loose += inside
         elif path.exists():
-            manifest = _read_manifest(path)
+            manifest = read_manifest(path)
             if manifest is None:
                 loose.append(path)
             else:
@@ -244,14 +249,35 @@ def _with_copies(jobs: Sequence[Job]) -> list[Job]:
     return marked
 
 
-def _read_manifest(path: Path) -> list[Job] | None:
+def listed_jobs(path: Path) -> list[Job] | None:
+    """Return the jobs of a manifest or of a fleet's table; None for a log. Raises `InputError` naming the row."""
+    if path.suffix.lower() != ".parquet":
+        return read_manifest(path)
+    try:
+        if not {"device", "file", "static"} <= set(names := pq.read_schema(path).names):
+            return None
+        rows = pq.read_table(path, columns=[name for name in _COLUMNS if name in names]).to_pylist()
+    except (OSError, pa.ArrowException):  # which reading it as a log explains
+        return None
+    stated = [_parse_options(row.pop("options", None) or "", str(path), Path()) for row in rows]
+    cells: list[Json] = [{name: text or "" for name, text in row.items()} for row in rows]
+    return [replace(Job(**row), options=options) for row, options in zip(cells, stated, strict=True)]
+
+
+def options_text(options: Iterable[tuple[str, str]]) -> str:
+    """Return options as a manifest has them."""
+    return shlex.join(f"--{name.replace('_', '-')}={value}" for name, value in options)
+
+
+def read_manifest(path: Path) -> list[Job] | None:
     """Return the jobs of a manifest; None for what is no manifest but a log. Raises `InputError` naming the row."""
     if path.suffix.lower() != ".csv":
         return None
     try:
         with readable(path), path.open(encoding="utf-8-sig", newline="") as file:
             header = [cell.strip().lower() for cell in next(csv.reader([file.readline(65536)]), [])]
-            if not {"device", "file"} <= set(header):
+            owner = "device" if "device" in header else "unit"
+            if not {owner, "file"} <= set(header):
                 return None
             only(dict.fromkeys(header), _COLUMNS, str(path), "the header")
             rows = [
@@ -267,7 +293,7 @@ def _read_manifest(path: Path) -> list[Job] | None:
         if len(row) != len(header):
             raise InputError(f"{path}, row {number}: {len(row)} cells under {len(header)} column names.")
         cells = {name: cell.strip() for name, cell in zip(header, row, strict=True)}
-        for name in ("device", "file"):
+        for name in (owner, "file"):
             if not cells[name]:
                 raise InputError(f"{path}, row {number}: the {name} is missing.")
         file = str(path.parent / cells["file"])
@@ -276,13 +302,15 @@ def _read_manifest(path: Path) -> list[Job] | None:
         files[file] = number
         jobs.append(
             Job(
-                cells["device"],
+                cells[owner],
                 file,
                 cells.get("date", ""),
                 cells.get("lot", ""),
                 _parse_options(cells.get("options", ""), f"{path}, row {number}", path.parent),
                 str(path.parent / cells["static"]) if cells.get("static") else "",
                 cells.get("station", ""),
+                unit=cells.get("unit", ""),
+                session=cells.get("session", ""),
             )
         )
     return jobs

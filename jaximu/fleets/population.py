@@ -35,6 +35,7 @@ from jaximu.mistakes.titles import effect_title
 
 FEWEST = 8
 """Units from which a population is spoken of."""
+_OF_SESSIONS = ["device", "unit", "session"]
 _SUMMED = ["file", "status", "message", "verdict", "effects", "gyro_unit"]
 _MOST = 10_000
 """Units that the population is estimated from, evenly taken from a larger fleet: what keeps the memory bounded."""
@@ -149,7 +150,7 @@ class Fleet(Result, Document, page="fleet"):
     failed: the files that could not be calibrated by reason, most first; reasons that differ in numbers only are one.
     values, sigma, shrunk, shrunk_sigma: (n, p) of at most `_MOST` units, alone and with the population as prior. lots:
     theirs, "" where none is known; shifts: what lots and dates add. rms: (n, 2), of the norm of gravity (m/s²) and of
-    carried gravity (degrees).
+    carried gravity (degrees). places: unit and session of recordings whose session is stated.
     """
 
     table: str
@@ -169,6 +170,7 @@ class Fleet(Result, Document, page="fleet"):
     shifts: Shifts | None
     rms: FloatArray
     notes: tuple[str, ...]
+    places: frozenset[tuple[str, str]] = frozenset()
 
     def document(self) -> Json:
         """Return the findings as a JSON document of schema `jaximu.fleet/1`."""
@@ -304,13 +306,16 @@ def read_fleet(table: FilePath) -> Fleet:
     """Question a table of `jaximu fleet` as a whole. Raises `InputError` where it is no such table."""
     path = Path(table)
     require_table(path, (*_COLUMNS, "gyro_unit"))
-    statuses, verdicts, effects = Counter(), Counter(), Counter()
+    statuses, verdicts, effects, places = Counter(), Counter(), Counter(), set()
     failed = {}
     reasons = {}
     kinds, remarked = Counter(), 0  # with a gyroscope, or without
     with pq.ParquetFile(path) as file:
-        for batch in file.iter_batches(batch_size=4096, columns=_SUMMED):
+        with_sessions = [name for name in _OF_SESSIONS if name in file.schema_arrow.names]  # older tables have none
+        for batch in file.iter_batches(batch_size=4096, columns=[*_SUMMED, *with_sessions]):
             for row in batch.to_pylist():
+                if row.get("session"):
+                    places.add((row["unit"] or row["device"], row["session"]))
                 statuses[row["status"]] += 1
                 if row["verdict"]:
                     verdicts[row["verdict"]] += 1
@@ -341,7 +346,8 @@ def read_fleet(table: FilePath) -> Fleet:
         notes.append(f"fewer than {FEWEST} calibrated units: no population.")
     else:
         known = _of_population(path, _units(kept, gyroscope), gyroscope, total)
-    return Fleet(str(table), statuses.total(), statuses, verdicts, effects, failed, **known, notes=tuple(notes))
+    known |= {"notes": tuple(notes), "places": frozenset(places)}
+    return Fleet(str(table), statuses.total(), statuses, verdicts, effects, failed, **known)
 
 
 def _of_population(path: Path, units: _Units, gyroscope: bool, total: int) -> Json:

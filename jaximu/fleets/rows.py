@@ -22,7 +22,7 @@ from jaximu.estimation.solver import Failure
 from jaximu.estimation.uncertainty import gains_open, open_numbers, weak_directions
 from jaximu.fleets.field import FieldUnit, field_row, field_unit
 from jaximu.fleets.fit import FleetUnit, fit_units
-from jaximu.fleets.jobs import Job, Settings
+from jaximu.fleets.jobs import Job, Settings, options_text
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import Json
 from jaximu.ground.errors import FilePath, InputError, JaximuError, NotPossibleError
@@ -67,6 +67,7 @@ def _of_triads(*triads: str) -> list[pa.Field]:
 
 
 _UNITS = {"accel_rms": "m/s^2", "gyro_rms": "deg"}
+_OF_JOB = ("device", "file", "date", "lot", "static", "station", "unit", "session")
 _TEXT = ("device", "file", "status", "message", "verdict", "effects")
 SCHEMA = pa.schema(
     [
@@ -83,6 +84,7 @@ SCHEMA = pa.schema(
         *_of_triads("mag"),
         *(pa.field(f"mag_{name}", pa.float64(), metadata={"unit": "uT"}) for name in ("rms", "field", "field_sigma")),
         *(pa.field(f"mag_{name}", pa.string()) for name in ("unit", "message")),
+        *(pa.field(name, pa.string()) for name in ("unit", "session", "options")),
     ],
     metadata={
         "jaximu": "jaximu.fleet/1",
@@ -138,19 +140,19 @@ class ReadJob:
 
 def row_begun(job: Job) -> Json:
     """Return a job's row before anything is known of it but the job."""
-    known = {name: getattr(job, name) or None for name in ("device", "file", "date", "lot", "static", "station")}
+    known = {name: getattr(job, name) or None for name in _OF_JOB}
     return dict.fromkeys(SCHEMA.names) | known
 
 
 def read_job(job: Job, settings: Settings) -> ReadJob:
     """Read, segment and, where it is asked for, diagnose one recording. Never raises: a failure is the job's row."""
-    row = row_begun(job)
+    row = row_begun(job) | {"options": options_text((dict(settings.options) | dict(job.options)).items()) or None}
     try:
         if job.copy_of:
             raise InputError(f"{job.file}: the same bytes as {job.copy_of}: one recording under two names, used once.")
         options, gyro_log = settings.reading(job)
         recording = read_recording(job.file, gyro_log, options)
-        noise = _noise(job.static, options) if job.static else None
+        noise = noise_at_rest(job.static, options) if job.static else None
         choices = Choices(settings.gravity, noise, settings.segmentation)
         with prepared([recording], misfit=partial(carried_error, choices=choices)) as (ready,):
             segmentation = segment(ready.recording, settings.segmentation)
@@ -172,7 +174,7 @@ def read_job(job: Job, settings: Settings) -> ReadJob:
 
 
 @lru_cache(maxsize=4)
-def _noise(path: str, options: ReadOptions) -> NoiseModel:
+def noise_at_rest(path: str, options: ReadOptions) -> NoiseModel:
     """Fit a recording at rest; the last ones are kept, for a fleet that shares one."""
     return fit_noise(read_recording(path, None, options))
 

@@ -11,7 +11,7 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe
 from jaximu.fleets.population import Difference, Fleet, Population
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.page import Items, Page, Part, Picture, Section, Table
+from jaximu.ground.page import Items, Page, Part, Picture, Section, Statement, Table
 from jaximu.ground.quantities import counted, number, probability, sentence, with_interval
 from jaximu.mistakes.titles import effect_title
 from jaximu.report import figures
@@ -30,8 +30,11 @@ _KINDS = (
 )
 
 
-def page_of(fleet: Fleet, magnetometers: Sequence[str] = ()) -> Page:
-    """Return the population, outliers, what lots and dates change, what failed; `magnetometers`: sentences on these."""
+def page_of(fleet: Fleet, magnetometers: Sequence[str] = (), stated: str = "") -> Page:
+    """Return the population, outliers, what lots and dates change, what failed.
+
+    `magnetometers`: sentences on these; `stated`: options of the command line that a diagnosis needs as well.
+    """
     done = fleet.statuses["ok"]
     document = Path(fleet.table).with_suffix(".json").name
     picture = Picture(
@@ -64,6 +67,7 @@ def page_of(fleet: Fleet, magnetometers: Sequence[str] = ()) -> Page:
             *(() if fleet.population is None else (picture,)),
             _outliers(fleet, document),
             *_differences(fleet),
+            *_sessions(fleet, stated),
             _failures(fleet, document),
             Section("Magnetometers", [Items(magnetometers)]),
         ),
@@ -176,6 +180,19 @@ def difference_words(difference: Difference) -> str:
     if more > 0:
         parts.append(f"{more} more parameters")
     return sentence(difference.text + (f": {', '.join(parts)}" if parts else ""))
+
+
+def _sessions(fleet: Fleet, stated: str) -> Iterator[Statement]:
+    units, sessions = (len({place[index] for place in fleet.places}) for index in (0, 1))
+    if units > 1 and sessions > 1:
+        from jaximu.diagnosis import COMMON_DRIFT  # most pages do without a diagnosis
+
+        yield Statement(
+            "Units and sessions",
+            f"{units} units were recorded in {sessions} sessions. A table has no time courses: `jaximu diagnose "
+            f"{shlex.quote(fleet.table)}{stated} -o RESULTS` looks for a drift that gyroscopes of a session have in "
+            f"common ({COMMON_DRIFT}), and says what belongs to a unit, to a session or to all.",
+        )
 
 
 def _failures(fleet: Fleet, document: str) -> Section:
