@@ -562,7 +562,7 @@ def stated_noise(path: Path) -> SensorNoise:
     }
 
 
-def allowing_for(calibration: Calibration, path: Path | None) -> tuple[Calibration, tuple[str, ...]]:
+def allowing_for(calibration: jaximu.Calibration, path: Path | None) -> tuple[jaximu.Calibration, tuple[str, ...]]:
     """Return a calibration that allows for what its recording cannot see by a diagnosis of it, and that in words.
 
     Raises `InputError` for the diagnosis of another recording.
