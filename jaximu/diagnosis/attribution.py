@@ -333,6 +333,10 @@ class CommonDrift:
     loadings: dict[str, FloatArray]
     axes: FloatArray
 
+    def finding(self) -> Attributed:
+        """Return it as what belongs to its session."""
+        return Attributed(COMMON_DRIFT, "session", tuple(self.loadings), (self.session,), self.share, self.p_value)
+
     @classmethod
     def of(cls, parts: Sequence[BoardRecording], draws: int = DRAWS) -> CommonDrift:
         """Return what recordings of a session have most in common in time, whether by chance or not.
@@ -667,19 +671,18 @@ def attribute(
     `statics`: a recording at rest of each, or its noise, where there is one; `level`: of all attributions together
     where nothing belongs to anything; `report`: is given each step in words; `options`: as for [`jaximu.diagnose`][].
 
-    Recordings that cannot be diagnosed are skipped. Raises `InputError` and `NotPossibleError` as `places_of` does, and
-    `InputError` as `jaximu.diagnose` does.
+    Recordings that cannot be diagnosed are skipped. Raises what `places_of` does, and `InputError` as `diagnose` does.
     """
     recordings, gravity = recordings_of(list(recordings)), as_gravity(gravity)
     files = [recording.sources[0].path if recording.sources else recording.name for recording in recordings]
     places, skipped = require_apart(files, places) if places else places_of(files, pattern), {}
-    own = [{"static": static} if static is not None else {} for static in statics] or [{}] * len(recordings)
+    at_rest = list(statics) or [None] * len(recordings)
 
     def ask(index: int, recording: Recording, what: str, known: Sequence[KnownEffect] = ()) -> BoardRecording | None:
         unit, session = places[index]
         report(f"unit {unit} in session {session}{what}, {index + 1} of {len(recordings)}")
         try:
-            diagnosis = diagnose(recording, gravity, level=level, known=known, **options | own[index])
+            diagnosis = diagnose(recording, gravity, level=level, known=known, static=at_rest[index], **options)
         except NotPossibleError as error:
             skipped[files[index] + what] = str(error)
             return None
@@ -704,12 +707,8 @@ def attribute(
                 parts[index] = min(part.repeated(second, known, index in steady), part, key=_rank)
     split_up, single, _ = attributed(list(parts.values()), common, level)
     lines, apart = attributed_lines(list(parts.values()), level)
-    of_sessions = (
-        Attributed(COMMON_DRIFT, "session", tuple(drift.loadings), (drift.session,), drift.share, drift.p_value)
-        for drift in common
-    )
-    findings, single = (*of_sessions, *split_up, *lines), single | apart
-    return Attribution(tuple(parts.values()), findings, tuple(drifts), single, skipped, gravity.latitude)
+    findings = (*(drift.finding() for drift in common), *split_up, *lines)
+    return Attribution(tuple(parts.values()), findings, tuple(drifts), single | apart, skipped, gravity.latitude)
 
 
 def _without_common_drift(
@@ -759,7 +758,7 @@ def attributed(
         apart = _places(parts, name)
         for share in divided.parts:
             mine = [part for part, owner in zip(parts, owners[share.belongs_to], strict=True) if owner in share.values]
-            apart = [place for place in apart if place not in {part.place for part in mine}]
+            apart = [where for where in apart if where not in {part.place for part in mine}]
             findings.append(
                 Attributed(
                     name,

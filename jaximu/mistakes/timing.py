@@ -152,9 +152,9 @@ def _taken_evenly(sensor: Sensor, even: FloatArray) -> float:
     misfit, scale = sensor.curvature, np.maximum(sensor.local, 1e-300)
     used = (misfit != 0) & (np.abs(misfit) < _FAR * scale)
     around = np.where(used, wide * deviation / scale**2, 0.0)
-    expected, seen = np.sum(around * near * deviation), np.sum(around * misfit)
-    variance = np.sum((around * (misfit - seen / expected * near * deviation)) ** 2)
-    return float(expected * (expected - 2 * seen) / (2 * variance)) if variance > 0 else 0.0
+    expected, measured = np.sum(around * near * deviation), np.sum(around * misfit)
+    variance = np.sum((around * (misfit - measured / expected * near * deviation)) ** 2)
+    return float(expected * (expected - 2 * measured) / (2 * variance)) if variance > 0 else 0.0
 
 
 def in_bursts(interval: FloatArray) -> bool:

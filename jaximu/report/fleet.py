@@ -183,7 +183,7 @@ def difference_words(difference: Difference) -> str:
 
 
 def _sessions(fleet: Fleet, stated: str) -> Iterator[Statement]:
-    units, sessions = (len({place[index] for place in fleet.places}) for index in (0, 1))
+    units, sessions = (len({where[index] for where in fleet.places}) for index in (0, 1))
     if units > 1 and sessions > 1:
         from jaximu.diagnosis import COMMON_DRIFT  # most pages do without a diagnosis
 
