@@ -149,7 +149,7 @@ def _taken_evenly(sensor: Sensor, even: FloatArray) -> float:
     near, wide = np.zeros_like(values), np.zeros_like(values)
     near[1:-1] = (values[2:] - values[:-2]) / 2
     wide[4:-4] = (values[7:-1] + values[8:] - values[1:-7] - values[:-8]) / 14
-    misfit, scale = sensor.curvature, np.maximum(sensor.local, 1e-300)
+    misfit, scale = sensor.curvature, np.maximum(sensor.local, 1e-100)
     used = (misfit != 0) & (np.abs(misfit) < _FAR * scale)
     around = np.where(used, wide * deviation / scale**2, 0.0)
     expected, measured = np.sum(around * near * deviation), np.sum(around * misfit)
