@@ -87,9 +87,9 @@ def test_a_lag_of_all_axes_alike_is_said_to_hardly_show():
     late = CATALOGUE["gyro.lag"](np.full(3, 0.02))
     found = jaximu.diagnose(recorded(late), EXACT)
     (lag,) = (cause for cause in found.hidden if cause.name == "gyro.lag")
-    weights, limit = lag.hardly
+    weights, limit = lag.weakest
     np.testing.assert_allclose(weights, np.full(3, 3**-0.5), atol=0.1)
     assert found.verdict == "adequate" and lag.combination == "on all axes alike" and limit > 0.02 > 10 * lag.limit
     assert "on all axes alike, seen from" in " ".join(str(found.summary()).split())
     document = next(entry for entry in found.document()["hidden"] if entry["name"] == "gyro.lag")
-    assert document["hardly"]["limit"] == limit
+    assert document["weakest"]["limit"] == limit

@@ -252,9 +252,9 @@ class Diagnosis(Result, Document, page="diagnosis"):
             },
             "hidden": [
                 entries(cause, "name", "limit", "unit", "shift")
-                | {"hardly": {"combination": weights.tolist(), "limit": limit if np.isfinite(limit) else None}}
+                | {"weakest": {"combination": weights.tolist(), "limit": limit if np.isfinite(limit) else None}}
                 for cause in self.hidden
-                for weights, limit in [cause.hardly]
+                for weights, limit in [cause.weakest]
             ],
             "checks": [check.document() for check in self.checks],
             "next": [

@@ -23,7 +23,7 @@ class Hidden:
     """A cause as large as its detection limit: `limit` in `unit`, and the shift of each number that it would move.
 
     shift: by the number's name, in its standard deviations, root mean square over the directions of the coefficients.
-    hardly: the combination (q,) of coefficients, of length one, that shows least, and its own limit, infinite where
+    weakest: the combination (q,) of coefficients, of length one, that shows least, and its own limit, infinite where
     nothing shows it. The limit is that of random combinations, and says nothing of this one.
     """
 
@@ -31,12 +31,12 @@ class Hidden:
     limit: float
     unit: str
     shift: dict[str, float]
-    hardly: tuple[FloatArray, float]
+    weakest: tuple[FloatArray, float]
 
     @property
     def combination(self) -> str:
         """The combination that shows least, in words, where its limit is another than that of the others."""
-        weights, limit = self.hardly
+        weights, limit = self.weakest
         if limit < _LEAST * self.limit:
             return ""
         alike = weights.min() > 0.5 * weights.max()
@@ -62,7 +62,7 @@ def shift_by(state: State, block: EffectBlock) -> FloatArray:
 def hidden_causes(state: State) -> list[Hidden]:
     """Return each cause at its detection limit and what it would do, the worst first."""
     causes = [
-        Hidden(name, limit, unit, _shifts(state, name, limit), _hardly_seen(state.evidence, name, limit))
+        Hidden(name, limit, unit, _shifts(state, name, limit), _weakest(state.evidence, name, limit))
         for name, (limit, unit) in state.limits.items()
     ]
     return sorted(causes, key=lambda cause: -cause.worst[1])
@@ -76,7 +76,7 @@ def _shifts(state: State, name: str, limit: float) -> dict[str, float]:
     return {str(state.names[row]): float(size) for row, size in sizes if size >= _NOTHING}
 
 
-def _hardly_seen(evidence: Evidence, name: str, limit: float) -> tuple[FloatArray, float]:
+def _weakest(evidence: Evidence, name: str, limit: float) -> tuple[FloatArray, float]:
     """Return the combination of an effect's coefficients that shows least, where on its grid it shows most."""
     informations = [
         evidence.information(k) / block.sizes[:, None] / block.sizes

@@ -393,18 +393,18 @@ def _limits(diagnosis: Diagnosis) -> Iterator[Part]:
         ],
         brief=6,
     )
-    hardly = [
+    weakest = [
         f"{effect_title(cause.name)} {cause.combination}, "
         + (
             "which no test sees"
-            if np.isinf(cause.hardly[1])
-            else f"seen from {size(cause.hardly[1], cause.unit, 2)} on"
+            if np.isinf(cause.weakest[1])
+            else f"seen from {size(cause.weakest[1], cause.unit, 2)} on"
         )
         for cause in diagnosis.hidden
         if cause.combination
     ]
-    if hardly:
-        yield Statement("What a recording like this hardly shows", f"{sentence('; '.join(hardly))}.")
+    if weakest:
+        yield Statement("What a recording like this hardly shows", f"{sentence('; '.join(weakest))}.")
 
 
 def _shift_words(diagnosis: Diagnosis, cause: Hidden) -> str:
