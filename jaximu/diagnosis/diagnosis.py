@@ -788,7 +788,7 @@ class _Course:
             beside = promising(experiment, state)
             predicted = left_out_likelihood(experiment, state) if beside is None else beside.log_likelihood
             kinds = [CATALOGUE[entry.name] for entry in self.extension.found]
-            inputs = {(kind.owner, kind.curved()) for kind in kinds}
+            inputs = {(kind.owner, kind.curved()) for kind in kinds if kind.curved()}
             # and not two of the same input
             one_curve = beside is not None and (beside.effect.owner, beside.effect.curved()) in inputs
             # what was named in part was a guess at the same misfit, or the curve is of what it leaves
