@@ -94,3 +94,12 @@ def test_a_lag_of_all_axes_alike_is_said_to_hardly_show():
     assert "on all axes alike, seen from" in " ".join(str(found.summary()).split())
     document = next(entry for entry in found.document()["hidden"] if entry["name"] == "gyro.lag")
     assert document["weakest"]["limit"] == limit
+
+
+def test_a_step_is_no_guess_because_the_bias_drifts_besides():
+    """Effects of nothing but time have no input in common with a curve over time."""
+    made = recorded(CATALOGUE["accel.step"](0.02 * SIGNS, onset=70.0))
+    force = made.accelerometer
+    drift = 0.006 * np.sin(5 * np.pi * force.time / force.time[-1])[:, None] * np.array([1.0, 0.3, -0.6])
+    drifting = made.__class__(force.__class__(force.time, force.values + drift, force.unit), made.gyroscope)
+    assert names(jaximu.diagnose(drifting, EXACT)) == {"accel.step", "accel.learned_time"}
