@@ -682,7 +682,7 @@ def attribute(
         unit, session = places[index]
         report(f"unit {unit} in session {session}{what}, {index + 1} of {len(recordings)}")
         try:
-            diagnosis = diagnose(recording, gravity, level=level, known=known, static=at_rest[index], **options)
+            diagnosis = diagnose(recording, gravity, level=level, known=known, **{"static": at_rest[index]} | options)
         except NotPossibleError as error:
             skipped[files[index] + what] = str(error)
             return None

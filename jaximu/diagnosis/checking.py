@@ -144,7 +144,7 @@ def _checked(
             )
     except NotPossibleError as error:
         return _followed(calibration, old, recordings, gravity, noise, level, error)
-    data = RecordedByHand(parts, observed_poses(parts, gravity.value, noise=noise), known)
+    data = RecordedByHand(parts, observed_poses(parts, gravity.value), known)
     data = data if noise is None else data.with_noise(noise)
     notes = [finding.text for finding in findings]
     notes += [note for source in (*recordings, *parts) for note in source.notes]
