@@ -263,6 +263,21 @@ def test_a_weak_second_effect_does_not_make_a_pair():
     assert pairs[4.0] >= 18
 
 
+def test_three_effects_are_named_together_that_each_imitate_a_fourth():
+    """One after another they are not found: what is like all three together leads, and stays beside the others."""
+    triples = 0
+    for seed in range(20):
+        random, jacobian, blocks = problem([26, seed], rows=90)
+        true, noise = (1, 3, 5), random.standard_normal(90)
+        planted_effects = [planted(Evidence(noise, jacobian, blocks), k, 4, random) for k in true]
+        alike = sum(planted_effects) + 0.6 * np.linalg.norm(sum(planted_effects)) * random.standard_normal(90) / 9.5
+        blocks.append(EffectBlock("like all three", alike[:, None], np.ones(1)))
+        found = select(Evidence(noise + sum(planted_effects), jacobian, blocks))
+        assert found.scores.p_value.argmin() == len(blocks) - 1
+        triples += {cause.block for cause in found.causes} == set(true) and found.complete
+    assert triples >= 17
+
+
 def test_the_only_cause_of_another_sensor_needs_less_beside_a_strong_one():
     """Two of one sensor imitate what is outside the catalogue; so do two whose conditions are alike."""
     random = np.random.default_rng(23)

@@ -11,7 +11,16 @@ import numpy as np
 from jaximu.diagnosis.evidence import EffectBlock, Evidence, strength
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.improvement import on_held_out
-from jaximu.diagnosis.selection import BESIDE, SelectedCause, Selection, causes_of, one_curve, select, strength_needed
+from jaximu.diagnosis.selection import (
+    BESIDE,
+    MOST,
+    SelectedCause,
+    Selection,
+    causes_of,
+    one_curve,
+    select,
+    strength_needed,
+)
 from jaximu.ground.errors import NotPossibleError
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect
@@ -19,8 +28,6 @@ from jaximu.recordings.finding import Finding
 
 _DECISIVE = 5.0
 """Log-likelihood of another recording by which one of several causes must fall behind to be dropped: 150 to 1."""
-_MOST = 3
-"""Effects that one recording is trusted to name: beyond, combinations imitate what they are not."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +87,7 @@ def extend(
     guessed = False  # a cause was taken in that did not explain the misfit
     while selection.causes:
         guessed |= not selection.complete
-        if len(entries) - chosen + len(poses) + len(selection.causes) > _MOST:
+        if len(entries) - chosen + len(poses) + len(selection.causes) > MOST:
             break
         effects, blocks = list(state.effects), state.evidence.blocks
         coefficients, _ = state.evidence.most_likely([cause.block for cause in selection.causes])

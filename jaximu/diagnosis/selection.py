@@ -28,12 +28,14 @@ which two curves of one input are one curve that the catalogue lacks: each mends
 _SECOND_ORDER = 0.02
 """Share of a strong effect's own χ² that it may leave and still be taken alone: columns are those about a fit without
 the effect, so that a slope of 10 % against the gain leaves 1 % of χ² in the shape of a higher power."""
+MOST = 3
+"""Effects that one recording is trusted to name: beyond, combinations imitate what they are not."""
 _PARTNERS = 12
-"""Effects, best first, that are tried with every other where one alone does not do."""
+"""Effects, or pairs of them, best first, that are tried with every other where they do not do by themselves."""
 _TOGETHER = 4
 """Effects beside which drift is estimated: more than are ever named, fewer than imitate any misfit."""
 _TRIED = 40
-"""Pairs, best first, that are asked whether they leave anything."""
+"""Pairs or triples, best first, that are asked whether they leave anything."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ class Selection:
 
 
 def select(evidence: Evidence, level: float = LEVEL) -> Selection:
-    """Name what is missing: nothing, one effect, a pair, or the strongest one of what stays incomplete.
+    """Name what is missing: nothing, one effect, a pair, a triple, or the strongest one of what stays incomplete.
 
     A cause explains a misfit if, once it is in the model, no test of the whole family stands out any more, at a tenth
     of the level: at the level itself one true cause in twenty would be refused. Causes are ranked by
@@ -88,16 +90,12 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
         return Selection((_cause(evidence, named + rivals, scores),), True, p_value, scores)
     if best and evidence.blocks[best[0]].kind == "effect" and _second_order(evidence, scores, best[0]):
         return Selection((_cause(evidence, close, scores),), True, p_value, scores)
-    pairs = _pairs(evidence, best[:_PARTNERS], explain)
-    if pairs:
-        (first, second), top = max(pairs.items(), key=lambda item: item[1])
-        together = {pair: value for pair, value in pairs.items() if value > top - _TIE}
-        causes = []
-        for one, other in ((first, second), (second, first)):
-            beside = evidence.scores([other])
-            rivals = {k for pair in together if other in pair for k in pair} - {one, other}
-            causes.append(_cause(evidence, [one, *sorted(rivals)], beside))
-        return Selection(tuple(sorted(causes, key=lambda cause: -cause.statistic)), True, p_value, scores)
+    starts = [(k,) for k in best]
+    while starts and len(starts[0]) < MOST:
+        ranked = _with_one_more(evidence, starts[:_PARTNERS])
+        if together := _explaining(evidence, ranked, explain):
+            return Selection(_causes_together(evidence, together), True, p_value, scores)
+        starts = list(ranked)
     # what lies outside all spans may be the only thing that stands out: then nothing deserves a name
     named = [k for k in close if evidence.blocks[k].kind == "effect"]
     named = [k for k in named if evidence.family_wise(float(scores.p_value[k])) < level][:1]
@@ -234,25 +232,47 @@ def _taken(evidence: Evidence, one: int, other: int) -> float:
     return 1 - float(beside.statistic[other] * beside.unit**2 / (alone.statistic[other] * alone.unit**2))
 
 
-def _pairs(evidence: Evidence, first: Sequence[int], explain: Callable[..., bool]) -> dict[tuple[int, int], float]:
-    """Return the pairs that explain the misfit, with their criterion; the likeliest are tried, best first."""
-    alone = evidence.scores()
-    beside = {one: evidence.scores([one]) for one in first}
-    ranked: dict[tuple[int, int], float] = {}
-    for one in first:
-        for other in _leaders(evidence, beside[one]):
-            if evidence.blocks[one].name != evidence.blocks[other].name and beside[one].times(other) > _SEPARATE:
-                pair = (min(one, other), max(one, other))
-                ranked[pair] = criterion(evidence, alone, one) + criterion(evidence, beside[one], other)
+def _with_one_more(evidence: Evidence, starts: Sequence[tuple[int, ...]]) -> dict[tuple[int, ...], float]:
+    """Return sets of one effect more than those to start from, best first, and their criteria."""
+    ranked: dict[tuple[int, ...], float] = {}
+    for start in starts:
+        together = sum(criterion(evidence, evidence.scores(start[:k]), one) for k, one in enumerate(start))
+        names, beside = {evidence.blocks[k].name for k in start}, evidence.scores(start)
+        for other in _leaders(evidence, beside):
+            if evidence.blocks[other].name not in names and beside.times(other) > _SEPARATE:
+                ranked[tuple(sorted((*start, other)))] = together + criterion(evidence, beside, other)
+    return dict(sorted(ranked.items(), key=lambda entry: -entry[1]))
 
-    def stands(one: int, other: int) -> bool:
-        return evidence.scores([one]).times(other) > strength_needed(evidence, other, [one])
 
-    pairs: dict[tuple[int, int], float] = {}
-    for pair in sorted(ranked, key=lambda pair: -ranked[pair])[:_TRIED]:
-        if pairs and ranked[pair] < max(pairs.values()) - _TIE:
+def _explaining(
+    evidence: Evidence, ranked: dict[tuple[int, ...], float], explain: Callable[..., bool]
+) -> dict[tuple[int, ...], float]:
+    """Return the sets that explain the misfit, with their criterion; the likeliest are tried, best first.
+
+    Each effect must be so strong beside the others that chance leads to none, however many sets are tried.
+    """
+
+    def stands(one: int, blocks: tuple[int, ...]) -> bool:
+        others = [k for k in blocks if k != one]
+        strong = evidence.scores(others).times(one) > strength_needed(evidence, one, others)
+        return strong and not any(one_curve(evidence, one, other) for other in others)
+
+    together: dict[tuple[int, ...], float] = {}
+    for blocks, value in list(ranked.items())[:_TRIED]:
+        if together and value < max(together.values()) - _TIE:
             break
-        one, other = pair
-        if explain(*pair) and stands(one, other) and stands(other, one) and not one_curve(evidence, one, other):
-            pairs[pair] = ranked[pair]
-    return pairs
+        if explain(*blocks) and all(stands(one, blocks) for one in blocks):
+            together[blocks] = value
+    return together
+
+
+def _causes_together(evidence: Evidence, together: dict[tuple[int, ...], float]) -> tuple[SelectedCause, ...]:
+    """Return the best set as causes, strongest first; rivals of each are what takes its place in sets as good."""
+    chosen = max(together, key=lambda blocks: together[blocks])
+    close = [set(blocks) for blocks, value in together.items() if value > together[chosen] - _TIE]
+    causes = []
+    for one in chosen:
+        others = set(chosen) - {one}
+        rivals = set().union(*(blocks for blocks in close if others <= blocks)) - set(chosen)
+        causes.append(_cause(evidence, [one, *sorted(rivals)], evidence.scores(sorted(others))))
+    return tuple(sorted(causes, key=lambda cause: -cause.statistic))
