@@ -25,8 +25,8 @@ from real_diagnosis import MIMU4444
 from simulated_board import PATTERN, board
 
 from jaximu import read_recording, wgs84_gravity
-from jaximu.diagnosis import COMMON_DRIFT, CommonDrift, attribute, diagnose
-from jaximu.diagnosis.attribution import BoardRecording, split
+from jaximu.diagnosis import COMMON_DRIFT, attribute, diagnose
+from jaximu.diagnosis.attribution import BoardRecording, common_drift, split
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 
@@ -76,7 +76,7 @@ def judged(parts, sensitive, warm):
     true |= {(COMMON_DRIFT, "session", warm)} if warm is not None else set()
     reported, shared = set(), {}
     for session in {part.session for part in parts}:
-        drift = CommonDrift.of([part for part in parts if part.session == session], DRAWS)
+        drift = common_drift([part for part in parts if part.session == session], DRAWS)
         if drift.p_value * SESSIONS < LEVEL:
             reported.add((COMMON_DRIFT, "session", session))
             shared[session] = np.stack([drift.times, drift.curve], axis=1)

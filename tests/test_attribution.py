@@ -5,11 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 from simulated_board import PATTERN, board
 
 from jaximu.cli.app import main
 from jaximu.diagnosis import COMMON_DRIFT, attribute, places_of
 from jaximu.diagnosis.attribution import attributed, split
+from jaximu.diagnosis.common_drift import CommonDrift, RestingRates
 from jaximu.diagnosis.lines import MOVING_LINE
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model.effects import CATALOGUE
@@ -41,6 +43,22 @@ def test_a_common_course_is_the_one_that_was_put_in(attribution):
     truth = np.exp(-drift.times / (0.3 * 68.5))
     assert np.corrcoef(drift.curve, truth)[0, 1] > 0.98
     assert all(np.linalg.norm(loadings) > 1 for loadings in drift.loadings.values())
+
+
+def test_drift_of_each_axis_alone_is_seldom_common():
+    """As a fleet's table asks: means alone, compared with noise that is made as slow as they are."""
+    seldom, boards = 0, 60
+    for seed in range(boards):
+        random = np.random.default_rng([54, seed])
+        times = np.arange(24) * 6.0
+        units = []
+        for unit in range(3):
+            up = random.standard_normal((24, 3))
+            walk = np.cumsum(random.standard_normal((24, 3)), axis=0)
+            means = walk + random.standard_normal((24, 3)) * random.uniform(0, 3)
+            units.append(RestingRates.of_means(str(unit), "1", times, up, means, random))
+        seldom += CommonDrift.of(units, random).p_value < 0.05
+    assert seldom <= binom.ppf(0.999, boards, 0.05)
 
 
 def test_a_common_course_is_taken_off_before_the_units_are_judged(attribution):

@@ -17,6 +17,7 @@ import jax
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from simulated_board import board
 
 from jaximu.calibration import fit_hand_held, nominal_imu
 from jaximu.calibration.recipe import Choices, calibrate_ready
@@ -291,7 +292,6 @@ def test_manifests_that_are_refused(tmp_path, capsys, content, message):
 
 
 def test_units_and_sessions_go_into_the_table_and_from_it_to_a_diagnosis(folder, tmp_path, capsys):
-    """The page has no time courses; it names the command that asks for what a session has in common."""
     logs = [os.path.relpath(path, tmp_path) for path in sorted(folder.glob("unit00[1-4].parquet"))]
     places = [("A", "1"), ("A", "2"), ("B", "1"), ("B", "2")]
     rows = [f"{unit},{session},{log},--stamp header" for (unit, session), log in zip(places, logs, strict=True)]
@@ -300,7 +300,7 @@ def test_units_and_sessions_go_into_the_table_and_from_it_to_a_diagnosis(folder,
     arguments = [str(tmp_path / "list.csv"), "-o", str(output), "--latitude", "48.1", "--axes", "x,y,z"]
     assert main(["fleet", *arguments, "--workers", "1"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert f"`jaximu diagnose {output} --latitude 48.1 -o RESULTS`" in printed and "session.common_drift" in printed
+    assert f"`jaximu diagnose {output} --latitude 48.1 -o RESULTS`" in printed and "share no drift" in printed
     table = pq.read_table(output).to_pylist()
     assert [(row["device"], row["unit"], row["session"]) for row in table] == [(u, u, s) for u, s in places]
     listed = {name: listed_jobs(path) for name, path in (("list", tmp_path / "list.csv"), ("table", output))}
@@ -309,6 +309,24 @@ def test_units_and_sessions_go_into_the_table_and_from_it_to_a_diagnosis(folder,
         assert [Path(job.file).resolve() for job in jobs] == [(tmp_path / log).resolve() for log in logs]
     assert dict(listed["table"][0].options) == {"stamp": "header", "axes": "x,y,z"}
     assert listed_jobs(folder / "unit001.parquet") is None
+
+
+def test_a_drift_that_units_of_a_session_share_is_on_the_fleets_page(tmp_path, capsys):
+    for recording in board(1, 3, 2, {}, [1]):
+        write_recording(recording, tmp_path / Path(recording.name).name)
+    rows = [f"{unit},{session},unit{unit}_session{session}.csv" for unit in (1, 2, 3) for session in (1, 2)]
+    (tmp_path / "list.csv").write_text("\n".join(["unit,session,file", *rows]), encoding="utf-8")
+    output = tmp_path / "fleet.parquet"
+    assert main(["fleet", str(tmp_path / "list.csv"), "-o", str(output), "--workers", "1"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "All units drift together in session 2" in printed and "supply" in printed
+    alone, warm = read_fleet(output).drifts
+    assert (alone.session, warm.session) == ("1", "2")
+    assert warm.p_value == pytest.approx(1 / 1001) and alone.p_value > 0.05
+    assert np.corrcoef(warm.curve, np.exp(-warm.times / (0.3 * 68.5)))[0, 1] > 0.98
+    assert "What the gyroscopes of a session have in common in time" in output.with_suffix(".html").read_text()
+    written = json.loads(output.with_suffix(".json").read_text())["common_drift"]
+    assert [drift["session"] for drift in written] == ["1", "2"]
 
 
 def test_usage_that_is_refused(folder, tmp_path, capsys):

@@ -6,9 +6,10 @@ from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
     from jaximu.diagnosis.attitude import diagnose_against_attitude
-    from jaximu.diagnosis.attribution import COMMON_DRIFT, Attributed, Attribution, CommonDrift, attribute, places_of
+    from jaximu.diagnosis.attribution import Attributed, Attribution, attribute, places_of
     from jaximu.diagnosis.checking import check
     from jaximu.diagnosis.checks import Check
+    from jaximu.diagnosis.common_drift import COMMON_DRIFT, CommonDrift
     from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose, twin_of
     from jaximu.diagnosis.experiment import KnownEffect
     from jaximu.diagnosis.magnetometer import (
@@ -49,9 +50,10 @@ __getattr__ = lazily(
     __name__,
     {
         "jaximu.diagnosis.attitude": "diagnose_against_attitude",
-        "jaximu.diagnosis.attribution": "COMMON_DRIFT, Attributed, Attribution, CommonDrift, attribute, places_of",
+        "jaximu.diagnosis.attribution": "Attributed, Attribution, attribute, places_of",
         "jaximu.diagnosis.checking": "check",
         "jaximu.diagnosis.checks": "Check",
+        "jaximu.diagnosis.common_drift": "COMMON_DRIFT, CommonDrift",
         "jaximu.diagnosis.diagnosis": "Diagnosis, Named, diagnose, twin_of",
         "jaximu.diagnosis.experiment": "KnownEffect",
         "jaximu.diagnosis.magnetometer": "MagneticDiagnosis, MagneticShift, check_magnetometer, diagnose_magnetometer",

@@ -5,8 +5,7 @@ unit u in session s are split as β_us = m + a_u + c_s + e_us: a value of the bo
 session, and what scatters from recording to recording, each normally distributed with a variance of its own (Searle,
 Casella and McCulloch, Variance Components, 1992, ch. 6). A value is there if it is significant beside the others.
 
-A time course that is common to all units of a session is the first principal component of their rates at rest. It is
-compared with what drift as large and as slow in each unit, but independent, has in common by chance.
+A time course that is common to all units of a session is taken off before its recordings are judged once more.
 """
 
 from __future__ import annotations
@@ -22,17 +21,17 @@ import numpy as np
 import scipy
 
 from jaximu.data.drift import restricted_likelihood
+from jaximu.diagnosis.common_drift import COMMON_DRIFT, CommonDrift, RestingRates
 from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose
 from jaximu.diagnosis.drift import DRAWS
-from jaximu.diagnosis.evidence import BLIND, FEWEST_DIMENSIONS, Evidence
+from jaximu.diagnosis.evidence import BLIND, Evidence
 from jaximu.diagnosis.experiment import KnownEffect
 from jaximu.diagnosis.improvement import cross_validated
 from jaximu.diagnosis.lines import MOVING_LINE, MovingLine, coincident
 from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.estimation.track import TRIADS
 from jaximu.ground.array_types import FloatArray, IntArray
-from jaximu.ground.differences import interpolated
-from jaximu.ground.distributions import chi2_sf, rms
+from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
@@ -43,8 +42,6 @@ from jaximu.ground.vectors import column_lengths, root_or_zero
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE
 from jaximu.recordings.recording import Recording, recordings_of
-
-COMMON_DRIFT = "session.common_drift"
 
 _WIDE = 8.0
 """Spread of the logarithm of a part's variance, in squares of usual sizes, beforehand: next to nothing is known."""
@@ -71,11 +68,6 @@ class Rests:
         """Return how the whitened conditions (n, 3 k) react to curves (o, k) in each axis of a triad."""
         columns = np.einsum("noi,ok->nki", self.reaction[triad], curves)
         return columns.reshape(len(columns), -1)
-
-    def off_orientation(self, rates: FloatArray) -> FloatArray:
-        """Return rates (o, …) without what follows orientation, a constant included."""
-        basis = orthonormal(np.concatenate([np.ones((len(self.times), 1)), self.up], axis=1))
-        return rates - np.tensordot(basis, np.tensordot(basis, rates, (0, 0)), 1)
 
 
 @dataclass(frozen=True)
@@ -130,6 +122,12 @@ class BoardRecording:
             diagnosis.verdict,
             lines=diagnosis.lines,
         )
+
+    def at_rest(self, random: np.random.Generator, draws: int) -> RestingRates:
+        """Return its rates at rest, with draws of noise that holds drift as the recording shows it, each axis alone."""
+        noise = self.evidence.draws(random, draws)
+        rates = self.rests.rates(np.concatenate([self.evidence.residual[:, None], noise], axis=1))
+        return RestingRates(self.unit, self.session, self.rests.times, self.rests.up, np.moveaxis(rates, 2, 0))
 
     def repeated(self, other: BoardRecording, known: Sequence[KnownEffect], without_drift: bool) -> BoardRecording:
         """Return the recording as diagnosed once more, effects taken off; estimates still come from before that."""
@@ -313,139 +311,6 @@ def _absence(columns: FloatArray, precision: FloatArray, values: FloatArray) -> 
 
 
 @dataclass(frozen=True)
-class CommonDrift:
-    """A time course that the rates at rest of all units of a session have in common, beside what follows orientation.
-
-    times (o,): s, on the clock of the recordings. curve (o,): rad/s, in a usual axis; what orientation could imitate of
-    it is as smooth as can be. share: of the variance of all axes. common: the same, each axis in units of its standard
-    deviation. chance: the median of that where drift is independent, as large and as slow in each axis as it is there.
-    p_value: that it then has as much in common. loadings: by unit, what its axes (3,) do in multiples of the curve.
-    axes (k, o): the drift of each axis that has a part in it, in multiples of its part, rad/s.
-    """
-
-    session: str
-    times: FloatArray
-    curve: FloatArray
-    share: float
-    common: float
-    chance: float
-    p_value: float
-    loadings: dict[str, FloatArray]
-    axes: FloatArray
-
-    def finding(self) -> Attributed:
-        """Return it as what belongs to its session."""
-        return Attributed(COMMON_DRIFT, "session", tuple(self.loadings), (self.session,), self.share, self.p_value)
-
-    @classmethod
-    def of(cls, parts: Sequence[BoardRecording], draws: int = DRAWS) -> CommonDrift:
-        """Return what recordings of a session have most in common in time, whether by chance or not.
-
-        `draws`: of independent drift, for chance and p-value. Raises `NotPossibleError` where they share no time.
-        """
-        times = _common_times(parts)
-        random = np.random.default_rng(20260101)
-        rates = np.concatenate([_rates(part, times, random, draws) for part in parts], axis=2)
-        rests = parts[0].rests
-        up = interpolated(rests.times, rests.up, times)
-        if draws:
-            rates[1:] = _as_slow(rates, times, up, random)
-        courses, shares = _principal(rates)
-        loadings = courses[0] @ rates[0]
-        usual = rms(loadings) * (np.sign(courses[0][0]) or 1.0)
-        pace = 1 / np.sqrt(np.diff(times))
-        steep = np.linalg.lstsq(pace[:, None] * np.diff(up, axis=0), pace * np.diff(courses[0]), rcond=None)[0]
-        curve = usual * (courses[0] - up @ steep)
-        return cls(
-            parts[0].session,
-            times,
-            curve - curve.mean(),
-            float(np.sum(loadings**2) / np.sum(rates[0] ** 2)),
-            float(shares[0]),
-            float(np.median(shares[1:])) if draws else 0.0,
-            float(np.mean(shares >= shares[0])),
-            {part.unit: row / usual for part, row in zip(parts, loadings.reshape(-1, 3), strict=True)},
-            usual * (rates[0] / loadings).T[np.abs(loadings) > abs(usual) / 2] - usual * (up @ steep),
-        )
-
-    @property
-    def size(self) -> float:
-        """By how much the rate of a usual axis changes, rad/s."""
-        return float(np.ptp(self.curve))
-
-    def taken_off(self, recording: Recording, part: BoardRecording) -> Recording:
-        """Return a recording without the curve, in each axis as large as the recording shows it.
-
-        **Arguments:** `part`: the recording as it was diagnosed, which is no part of the curve.
-        """
-        rests, off_base = part.rests, part.evidence.off_base
-        curve = np.interp(rests.times, self.times, self.curve)[:, None]
-        questions = [rests.columns(triad, curve) for triad in TRIADS]
-        columns = off_base(np.concatenate([*questions, rests.columns("gyroscope", rests.up)], axis=1))
-        size = np.maximum(column_lengths(columns), 1e-300)
-        amounts = np.linalg.lstsq(columns / size, part.evidence.residual, rcond=BLIND)[0] / size
-        changed = {}
-        for triad, amount in zip(TRIADS, amounts[:6].reshape(2, 3), strict=True):
-            signal = recording.signals[triad]
-            course = np.interp(signal.time, self.times, self.curve)
-            changed[triad] = replace(signal, values=signal.values - course[:, None] * amount)
-        return replace(recording, **changed)
-
-
-def _common_times(parts: Sequence[BoardRecording]) -> FloatArray:
-    """Return the middles of the rests (o,) of the recording with the fewest, where all recordings go on."""
-    first = max(part.rests.times[0] for part in parts)
-    last = min(part.rests.times[-1] for part in parts)
-    shortest = min((part.rests.times for part in parts), key=len)
-    times = shortest[(shortest >= first) & (shortest <= last)]
-    if len(times) < FEWEST_DIMENSIONS:
-        raise NotPossibleError(
-            f"session {parts[0].session}: its recordings have {len(times)} rests at the same time by their clocks; a "
-            "time course that units have in common needs one clock for all units of a session."
-        )
-    return times
-
-
-def _rates(part: BoardRecording, times: FloatArray, random: np.random.Generator, draws: int) -> FloatArray:
-    """Return rates at rest (1 + draws, o, 3) less what follows orientation: as measured, and as the noise draws them.
-
-    That noise holds drift as the recording shows it, each axis by itself.
-    """
-    evidence, rests = part.evidence, part.rests
-    noise = evidence.draws(random, draws)
-    values = rests.off_orientation(rests.rates(np.concatenate([evidence.residual[:, None], noise], axis=1)))
-    onto = interpolated(rests.times, np.eye(len(values)), times)
-    values = np.einsum("to,oik->kti", onto, values)
-    return values - values.mean(axis=1, keepdims=True)
-
-
-def _as_slow(rates: FloatArray, times: FloatArray, up: FloatArray, random: np.random.Generator) -> FloatArray:
-    """Return the draws among rates (1 + draws, o, k), independent random walks added, as slow as the measured axes.
-
-    Drift that a recording shows is pulled towards what is usual; draws that are too quick have too little in common.
-    As slow: their autocorrelation from rest to rest is that of the measured axes, a standard error added.
-    """
-    steps = np.sqrt(np.diff(times, prepend=2 * times[0] - times[1]))[:, None]
-    walks = np.cumsum(steps * random.standard_normal(rates[1:].shape), axis=1)
-    basis = orthonormal(np.concatenate([np.ones((len(times), 1)), up], axis=1))
-    walks = off(basis, walks)
-    scaled, walks = (values / np.maximum(np.std(values, axis=1, keepdims=True), 1e-300) for values in (rates, walks))
-    measured, drawn, walking = (
-        np.mean(values[:, 1:] * values[:, :-1], axis=1) for values in (scaled[:1], scaled[1:], walks)
-    )
-    wanted = np.mean(measured) + np.std(measured) / np.sqrt(measured.size)
-    slow, quick = np.mean(walking) - wanted, wanted - np.mean(drawn)
-    return scaled[1:] + np.sqrt(max(quick, 0.0) / max(slow, 1e-3)) * walks
-
-
-def _principal(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the first principal component (..., t), of length one, of axes (..., t, k), and its share of variance."""
-    scaled = values / np.maximum(np.std(values, axis=-2, keepdims=True), 1e-300)
-    u, s, _ = np.linalg.svd(scaled, full_matrices=False)
-    return u[..., :, 0], s[..., 0] ** 2 / np.sum(s**2, axis=-1)
-
-
-@dataclass(frozen=True)
 class Attributed:
     """A finding, and what it belongs to: "unit", "session" or "board".
 
@@ -530,15 +395,7 @@ class Attribution(Result, Document, page="attribution"):
             "software": SOFTWARE,
             "recordings": [part.document() for part in self.recordings],
             "attribution": [finding.document() for finding in self.findings],
-            "common_drift": [
-                {
-                    **entries(drift, "session", "times", "share", "common", "p_value"),
-                    "rate": drift.curve.tolist(),
-                    "common_by_chance": drift.chance,
-                    "loadings": {unit: row.tolist() for unit, row in drift.loadings.items()},
-                }
-                for drift in self.drifts
-            ],
+            "common_drift": [drift.document() for drift in self.drifts],
         }
 
     @property
@@ -650,6 +507,17 @@ def require_several(places: Iterable[tuple[str, str]], why: str = "") -> None:
         )
 
 
+def _finding(drift: CommonDrift) -> Attributed:
+    """Return a common drift as what belongs to its session."""
+    return Attributed(COMMON_DRIFT, "session", tuple(drift.loadings), (drift.session,), drift.share, drift.p_value)
+
+
+def common_drift(parts: Sequence[BoardRecording], draws: int = DRAWS) -> CommonDrift:
+    """Return what recordings of a session have most in common in time; `draws`: for what chance has in common."""
+    random = np.random.default_rng(20260101)
+    return CommonDrift.of([part.at_rest(random, draws) for part in parts], random)
+
+
 def attribute(
     recordings: Sequence[Recording],
     pattern: str = "",
@@ -692,7 +560,7 @@ def attribute(
     parts = {index: part for index, part in first.items() if part is not None}
     require_several([(part.unit, part.session) for part in parts.values()], next(iter(skipped.values()), ""))
     members = [[p for p in parts.values() if p.session == s] for s in _in_order(p.session for p in parts.values())]
-    drifts = [CommonDrift.of(of) for of in members if len(of) > 1]
+    drifts = [common_drift(of) for of in members if len(of) > 1]
     common = [drift for drift in drifts if drift.p_value * len(drifts) < level]
     steady = _without_common_drift(parts, recordings, common)
     for index, part in parts.items():
@@ -707,7 +575,7 @@ def attribute(
                 parts[index] = min(part.repeated(second, known, index in steady), part, key=_rank)
     split_up, single, _ = attributed(list(parts.values()), common, level)
     lines, apart = attributed_lines(list(parts.values()), level)
-    findings = (*(drift.finding() for drift in common), *split_up, *lines)
+    findings = (*(_finding(drift) for drift in common), *split_up, *lines)
     return Attribution(tuple(parts.values()), findings, tuple(drifts), single | apart, skipped, gravity.latitude)
 
 
@@ -719,8 +587,27 @@ def _without_common_drift(
     for index, part in parts.items():
         if part.session in sessions:
             others = [other for other in parts.values() if other.session == part.session and other is not part]
-            steady[index] = CommonDrift.of(others, 0).taken_off(recordings[index], part)
+            steady[index] = _taken_off(common_drift(others, 0), recordings[index], part)
     return steady
+
+
+def _taken_off(drift: CommonDrift, recording: Recording, part: BoardRecording) -> Recording:
+    """Return a recording without the curve, in each axis as large as the recording shows it.
+
+    **Arguments:** `part`: the recording as it was diagnosed, which is no part of the curve.
+    """
+    rests, off_base = part.rests, part.evidence.off_base
+    curve = np.interp(rests.times, drift.times, drift.curve)[:, None]
+    questions = [rests.columns(triad, curve) for triad in TRIADS]
+    columns = off_base(np.concatenate([*questions, rests.columns("gyroscope", rests.up)], axis=1))
+    size = np.maximum(column_lengths(columns), 1e-300)
+    amounts = np.linalg.lstsq(columns / size, part.evidence.residual, rcond=BLIND)[0] / size
+    changed = {}
+    for triad, amount in zip(TRIADS, amounts[:6].reshape(2, 3), strict=True):
+        signal = recording.signals[triad]
+        course = np.interp(signal.time, drift.times, drift.curve)
+        changed[triad] = replace(signal, values=signal.values - course[:, None] * amount)
+    return replace(recording, **changed)
 
 
 def _rank(part: BoardRecording) -> tuple[bool, int, float]:

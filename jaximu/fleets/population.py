@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, islice
@@ -21,6 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import scipy
 
+from jaximu.diagnosis.common_drift import CommonDrift, RestingRates
 from jaximu.estimation.problem import Name
 from jaximu.fleets.rows import COLUMN_PLACES, PARAMETERS, SCHEMA, covariances, free_places, require_table
 from jaximu.ground.array_types import FloatArray, IntArray
@@ -35,10 +36,14 @@ from jaximu.mistakes.titles import effect_title
 
 FEWEST = 8
 """Units from which a population is spoken of."""
-_OF_SESSIONS = ["device", "unit", "session"]
+_OF_SESSIONS = ["device", "unit", "session", "rest_time", "rest_up", "rest_rate"]
 _SUMMED = ["file", "status", "message", "verdict", "effects", "gyro_unit"]
 _MOST = 10_000
 """Units that the population is estimated from, evenly taken from a larger fleet: what keeps the memory bounded."""
+_UNITS_COMPARED = 32
+"""Units of a session that are asked for a drift in common, evenly taken: a time course needs no more."""
+COMMON_LEVEL = 0.05
+"""Probability that chance passes for a drift in common, over all sessions: what a diagnosis of them has."""
 LEVEL = 0.01
 """Probability of one false alarm in the whole fleet, for each kind of question."""
 _ROUNDS = 200
@@ -150,7 +155,8 @@ class Fleet(Result, Document, page="fleet"):
     failed: the files that could not be calibrated by reason, most first; reasons that differ in numbers only are one.
     values, sigma, shrunk, shrunk_sigma: (n, p) of at most `_MOST` units, alone and with the population as prior. lots:
     theirs, "" where none is known; shifts: what lots and dates add. rms: (n, 2), of the norm of gravity (m/s²) and of
-    carried gravity (degrees). places: unit and session of recordings whose session is stated.
+    carried gravity (degrees). places: unit and session of recordings whose session is stated. drifts: by session, what
+    gyroscopes of its units have in common in time, by chance or not.
     """
 
     table: str
@@ -171,6 +177,12 @@ class Fleet(Result, Document, page="fleet"):
     rms: FloatArray
     notes: tuple[str, ...]
     places: frozenset[tuple[str, str]] = frozenset()
+    drifts: tuple[CommonDrift, ...] = ()
+
+    @property
+    def common(self) -> list[CommonDrift]:
+        """The time courses that are more than chance."""
+        return [drift for drift in self.drifts if drift.p_value * len(self.drifts) < COMMON_LEVEL]
 
     def document(self) -> Json:
         """Return the findings as a JSON document of schema `jaximu.fleet/1`."""
@@ -203,6 +215,7 @@ class Fleet(Result, Document, page="fleet"):
                 }
                 for difference in self.differences
             ],
+            "common_drift": [drift.document() for drift in self.drifts],
             "notes": list(self.notes),
         }
 
@@ -306,7 +319,8 @@ def read_fleet(table: FilePath) -> Fleet:
     """Question a table of `jaximu fleet` as a whole. Raises `InputError` where it is no such table."""
     path = Path(table)
     require_table(path, (*_COLUMNS, "gyro_unit"))
-    statuses, verdicts, effects, places = Counter(), Counter(), Counter(), set()
+    statuses, verdicts, effects = Counter(), Counter(), Counter()
+    places: dict[tuple[str, str], Json] = {}
     failed = {}
     reasons = {}
     kinds, remarked = Counter(), 0  # with a gyroscope, or without
@@ -315,7 +329,7 @@ def read_fleet(table: FilePath) -> Fleet:
         for batch in file.iter_batches(batch_size=4096, columns=[*_SUMMED, *with_sessions]):
             for row in batch.to_pylist():
                 if row.get("session"):
-                    places.add((row["unit"] or row["device"], row["session"]))
+                    places[row["unit"] or row["device"], row["session"]] = row
                 statuses[row["status"]] += 1
                 if row["verdict"]:
                     verdicts[row["verdict"]] += 1
@@ -346,8 +360,31 @@ def read_fleet(table: FilePath) -> Fleet:
         notes.append(f"fewer than {FEWEST} calibrated units: no population.")
     else:
         known = _of_population(path, _units(kept, gyroscope), gyroscope, total)
-    known |= {"notes": tuple(notes), "places": frozenset(places)}
+    drifts, apart = _common_drifts(places)
+    known |= {"notes": (*notes, *apart), "places": frozenset(places), "drifts": drifts}
     return Fleet(str(table), statuses.total(), statuses, verdicts, effects, failed, **known)
+
+
+def _common_drifts(places: Mapping[tuple[str, str], Json]) -> tuple[tuple[CommonDrift, ...], list[str]]:
+    """Return what gyroscopes of each session's units have in common in time, and why some sessions cannot be asked."""
+    random, drifts, notes = np.random.default_rng(20260101), [], []
+    for session in sorted({session for _, session in places}):
+        rows = [(unit, row) for (unit, of), row in places.items() if of == session and row.get("rest_time")]
+        units = [
+            RestingRates.of_means(
+                unit,
+                session,
+                np.array(row["rest_time"]),
+                *(np.reshape(row[name], (-1, 3)) for name in ("rest_up", "rest_rate")),
+                random,
+            )
+            for unit, row in rows[:: max(1, -(-len(rows) // _UNITS_COMPARED))]
+        ]
+        try:
+            drifts += [CommonDrift.of(units, random)] if len(units) > 1 else []
+        except NotPossibleError as error:
+            notes.append(str(error))
+    return tuple(drifts), notes
 
 
 def _of_population(path: Path, units: _Units, gyroscope: bool, total: int) -> Json:

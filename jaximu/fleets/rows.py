@@ -28,10 +28,12 @@ from jaximu.ground.document import Json
 from jaximu.ground.errors import FilePath, InputError, JaximuError, NotPossibleError
 from jaximu.ground.quantities import listed
 from jaximu.ground.units import SENSORS
+from jaximu.ground.vectors import lengths_of
 from jaximu.mistakes import prepared
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.noise.at_rest import fit_noise
+from jaximu.recordings.observations import Poses
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import Segmentation, observed_poses, segment
@@ -85,6 +87,10 @@ SCHEMA = pa.schema(
         *(pa.field(f"mag_{name}", pa.float64(), metadata={"unit": "uT"}) for name in ("rms", "field", "field_sigma")),
         *(pa.field(f"mag_{name}", pa.string()) for name in ("unit", "message")),
         *(pa.field(name, pa.string()) for name in ("unit", "session", "options")),
+        *(
+            pa.field(f"rest_{name}", pa.list_(pa.float64()), metadata={"unit": unit})
+            for name, unit in {"time": "s", "up": "", "rate": "rad/s"}.items()
+        ),
     ],
     metadata={
         "jaximu": "jaximu.fleet/1",
@@ -93,7 +99,8 @@ SCHEMA = pa.schema(
         "(lower triangle, row by row, of gain and bias of the "
         "accelerometer, then of the gyroscope) without; nominal: three scales, three offsets; "
         "a magnetometer's gain (output units per µT, lower triangle) is in its own axes, which `jaximu magnetometer` "
-        "finds against the accelerometer's",
+        "finds against the accelerometer's; rest_time, rest_up, rest_rate: where a session is stated, when the unit "
+        "rested, the direction of specific force and the gyroscope's rate then, three numbers each",
     },
 )
 """Columns of the table. The first ones are the fixed surface; what does not apply is null."""
@@ -281,6 +288,8 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> Js
     }
     if unit.gyroscope and row["turns"]:
         row["gyro_rms"] = float(rms[1])
+    if unit.gyroscope and row["session"]:
+        row |= _at_rest(unit.observations.poses, fit.imu)
     left = [name in open_numbers(weak) for name in PARAMETERS]
     values = flatten(fit.imu)
     known = np.ma.masked_array(sigma, left).tolist()
@@ -290,6 +299,16 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> Js
         parts = listed(list(dict.fromkeys(f"{PARAMETERS[k].owner} {PARAMETERS[k].part}" for k in np.flatnonzero(left))))
         row["message"] = "; ".join(filter(None, [row["message"], _OPEN.format(parts)]))
     return row
+
+
+def _at_rest(poses: Poses, imu: Imu) -> Json:
+    """Return what a table keeps of a session's recording: when it rested, how it lay, and its gyroscope's rates."""
+    force, rate = (
+        np.linalg.solve(triad.gain, (np.asarray(mean, float)[np.asarray(poses.mask)] - triad.bias).T).T
+        for triad, mean in ((imu.accelerometer, poses.accelerometer_mean), (imu.gyroscope, poses.gyroscope_mean))
+    )
+    times = ((np.asarray(poses.start) + np.asarray(poses.stop)) / 2)[np.asarray(poses.mask)]
+    return {"rest_time": times, "rest_up": (force / lengths_of(force)[:, None]).ravel(), "rest_rate": rate.ravel()}
 
 
 def _require(fit: Fit, poses: int, where: str, sensor: str) -> None:

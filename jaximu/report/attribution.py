@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from jaximu.diagnosis import COMMON_DRIFT, Attributed, Attribution
+from jaximu.diagnosis import COMMON_DRIFT, Attributed, Attribution, CommonDrift
 from jaximu.diagnosis.diagnosis import stated_instead
 from jaximu.ground.page import Page, Part, Picture, Statement, Table
 from jaximu.ground.quantities import counted, listed, number, probability, readable, sentence, size, unit_text
@@ -35,14 +35,7 @@ def page_of(attribution: Attribution) -> Page:
 def _verdict(attribution: Attribution) -> Iterator[str]:
     texts = [_sentence(finding, attribution) for finding in attribution.findings if finding.name != COMMON_DRIFT]
     if attribution.common:
-        sessions = _names("session", [drift.session for drift in attribution.common], attribution.sessions)
-        sizes = listed([size(drift.size, "rad/s", 2) for drift in attribution.common])
-        shares = [100 * drift.share for drift in attribution.common]
-        share = f"{min(shares):.0f} %" if max(shares) - min(shares) < 1 else f"{min(shares):.0f} to {max(shares):.0f} %"
-        yield (
-            f"All units drift together in {sessions}: one time course, by {sizes} in a usual axis, is {share} of the "
-            "drift of all gyroscope axes."
-        )
+        yield drift_words(attribution.common, attribution.sessions)
     elif not texts:
         yield "Nothing repeats over the sessions of a unit or over the units of a session."
     yield from texts
@@ -53,6 +46,18 @@ def _verdict(attribution: Attribution) -> Iterator[str]:
             f"{sentence(counted(len(open_units), 'recording'))} of unit{'s' * (len(set(open_units)) > 1)} {where} "
             f"{'stay' if len(open_units) > 1 else 'stays'} unexplained."
         )
+
+
+def drift_words(common: Sequence[CommonDrift], sessions: Sequence[str]) -> str:
+    """Say in which of all sessions units drift together, by how much, and how much of all drift that is."""
+    where = _names("session", [drift.session for drift in common], sessions)
+    sizes = listed([size(drift.size, "rad/s", 2) for drift in common])
+    shares = [100 * drift.share for drift in common]
+    share = f"{min(shares):.0f} %" if max(shares) - min(shares) < 1 else f"{min(shares):.0f} to {max(shares):.0f} %"
+    return (
+        f"All units drift together in {where}: one time course, by {sizes} in a usual axis, is {share} of the drift of "
+        "all gyroscope axes."
+    )
 
 
 def _names(noun: str, names: Sequence[str], every: Sequence[str]) -> str:
@@ -72,14 +77,7 @@ def _sentence(finding: Attributed, attribution: Attribution) -> str:
 
 
 def _first(attribution: Attribution) -> Iterator[Part]:
-    if attribution.drifts:
-        yield Picture(
-            "attribution",
-            partial(_drift_figure, attribution),
-            "What the gyroscopes of a session have in common in time",
-            "Coloured: the common time course of each session, in a usual axis. Grey: each axis that has a part in it, "
-            "less what follows orientation, divided by its part; where grey follows the line, the course is common.",
-        )
+    yield from common_drift(attribution.drifts, attribution.common)
     yield Table(
         ("finding", "belongs to", "units", "sessions", "share", "p-value"),
         [
@@ -97,13 +95,25 @@ def _first(attribution: Attribution) -> Iterator[Part]:
         "the variance of all axes. p: that the part is not there, beside scatter from recording to recording.",
     )
     yield _verdicts_table(attribution)
-    if attribution.common:
+    yield from _look_alikes(attribution)
+
+
+def common_drift(drifts: Sequence[CommonDrift], common: Sequence[CommonDrift]) -> Iterator[Part]:
+    """Draw what units of each session have in common in time, and say what could be behind that which is no chance."""
+    if drifts:
+        yield Picture(
+            "attribution",
+            partial(_drift_figure, drifts, common),
+            "What the gyroscopes of a session have in common in time",
+            "Coloured: the common time course of each session, in a usual axis. Grey: each axis that has a part in it, "
+            "less what follows orientation, divided by its part; where grey follows the line, the course is common.",
+        )
+    if common:
         yield Statement(
             "What the common drift could be",
             "Temperature that was not logged (warm-up after power-on), the supply, or the board bending: what acts on "
             "all units at once. It belongs to the session, so no unit's calibration contains it.",
         )
-    yield from _look_alikes(attribution)
 
 
 def _look_alikes(attribution: Attribution) -> Iterator[Statement]:
@@ -139,14 +149,13 @@ def _short(diagnosis: dict) -> str:
     return ": ".join(filter(None, (diagnosis["verdict"] if diagnosis["verdict"] != "effects" else "", words)))
 
 
-def _drift_figure(attribution: Attribution) -> Figure:
-    drifts = attribution.drifts
+def _drift_figure(drifts: Sequence[CommonDrift], common: Sequence[CommonDrift]) -> Figure:
     factor, unit = readable("rad/s", max(drift.size for drift in drifts))
     figure, grid = figures.stacked(len(drifts), 2.0, 1.0, sharex=True, sharey=True)
     for axes, drift in zip(grid, drifts, strict=True):
         for line in drift.axes:
             axes.plot(drift.times, factor * line, color=figures.BEFORE, linewidth=0.6, alpha=0.5)
-        more, color = ("more", figures.AFTER) if drift in attribution.common else ("no more", figures.FLAGGED)
+        more, color = ("more", figures.AFTER) if drift in common else ("no more", figures.FLAGGED)
         axes.plot(drift.times, factor * drift.curve, color=color, linewidth=2)
         figures.dressed(axes, level=0.0)
         text = f"{more} in common than independent drift, p {probability(drift.p_value)}"

@@ -11,7 +11,7 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe
 from jaximu.fleets.population import Difference, Fleet, Population
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.page import Items, Page, Part, Picture, Section, Statement, Table
+from jaximu.ground.page import Items, Page, Part, Picture, Section, Table
 from jaximu.ground.quantities import counted, number, probability, sentence, with_interval
 from jaximu.mistakes.titles import effect_title
 from jaximu.report import figures
@@ -182,17 +182,21 @@ def difference_words(difference: Difference) -> str:
     return sentence(difference.text + (f": {', '.join(parts)}" if parts else ""))
 
 
-def _sessions(fleet: Fleet, stated: str) -> Iterator[Statement]:
-    units, sessions = (len({where[index] for where in fleet.places}) for index in (0, 1))
-    if units > 1 and sessions > 1:
-        from jaximu.diagnosis import COMMON_DRIFT  # most pages do without a diagnosis
+def _sessions(fleet: Fleet, stated: str) -> Iterator[Part]:
+    units, sessions = (sorted({place[index] for place in fleet.places}) for index in (0, 1))
+    if len(units) < 2 or len(sessions) < 2:
+        return
+    from jaximu.report.attribution import common_drift, drift_words  # most pages do without a diagnosis
 
-        yield Statement(
-            "Units and sessions",
-            f"{units} units were recorded in {sessions} sessions. A table has no time courses: `jaximu diagnose "
-            f"{shlex.quote(fleet.table)}{stated} -o RESULTS` looks for a drift that gyroscopes of a session have in "
-            f"common ({COMMON_DRIFT}), and says what belongs to a unit, to a session or to all.",
-        )
+    together = drift_words(fleet.common, sessions) if fleet.common else "Units of a session share no drift in time."
+    yield Section(
+        "Units and sessions",
+        [
+            f"{len(units)} units were recorded in {len(sessions)} sessions. {together} `jaximu diagnose "
+            f"{shlex.quote(fleet.table)}{stated} -o RESULTS` says what belongs to a unit, to a session or to all.",
+            *common_drift(fleet.drifts, fleet.common),
+        ],
+    )
 
 
 def _failures(fleet: Fleet, document: str) -> Section:
