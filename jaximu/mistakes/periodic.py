@@ -40,7 +40,8 @@ def _lines(sensor: Sensor, parts: FloatArray, power: FloatArray) -> Iterator[Fin
         noisy = np.median(density) > 1e-20 * np.mean(sensor.values[:, axis] ** 2)
         if sensor.coarse[axis] is not None or not noisy:
             continue  # rounding makes lines, too
-        ratios = density / _beside(density)
+        highest = density >= scipy.ndimage.maximum_filter1d(density, 2 * _LOBE + 1)  # else the flank of a hump
+        ratios = np.where(highest, density / _beside(density), 0.0)
         peak = np.argmax(ratios)
         ratio = ratios[peak]
         # a bin's mean over k blocks is gamma with shape k (windowed blocks do not overlap)
