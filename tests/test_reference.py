@@ -71,6 +71,19 @@ def test_truth_lies_within_the_intervals(found):
     assert after < 0.4 * before and unit == "deg/s"
 
 
+def test_stamps_of_an_epoch_are_counted_from_the_first(found):
+    """The rate between the clocks, 1e-5 uncertain, moved the offset at the epoch's zero by hours."""
+    made, epoch = moved(), 1.7e9
+    later = {name: replace(one, time=one.time + epoch) for name, one in unit_of(made).signals.items()}
+    recording = replace(unit_of(made), **later)
+    assert recording.start == epoch and np.abs(recording.gyroscope.time - made.time).max() < 1e-6
+    attitude = Attitude(made.stamp + epoch, made.quaternion, made.velocity)
+    absolute = calibrate_against_attitude(recording, attitude, GRAVITY)[0].reference["time_offset"]
+    known = found.reference["time_offset"]
+    assert abs(absolute["value"] - known["value"]) < 0.1 * known["sigma"]
+    assert absolute["sigma"] == pytest.approx(known["sigma"], rel=0.05)
+
+
 def test_an_inner_parameter_that_effects_share_is_one_number():
     """A lag and its square: their time constant's column is the sum of both, whichever comes first."""
     made = moved()

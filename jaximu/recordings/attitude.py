@@ -11,6 +11,7 @@ import scipy
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.vectors import dot_rows, lengths_of
+from jaximu.recordings.recording import whole_stamp
 
 UNIT_LENGTH = 0.01  # off one, of a quaternion that is one
 _JUMP = 2.0  # rad; between neighbouring stamps nothing turns so far
@@ -21,8 +22,8 @@ class Attitude:
     """What a reference says of a body, on its own stamps.
 
     time: (n,) s, rising. quaternion: (n, 4) w, x, y, z, from the body to a frame whose z points up. velocity, position:
-    (n, 3) in that frame, m/s and m, or None. start: absolute stamp of t = 0, s, where it has one. name: of the file.
-    notes: what reading it had to choose.
+    (n, 3) in that frame, m/s and m, or None. start: absolute stamp of t = 0, s, where it has one; stamps that are
+    absolute themselves are counted from the first. name: of the file. notes: what reading it had to choose.
     """
 
     time: FloatArray
@@ -42,6 +43,8 @@ class Attitude:
             )
         if not (np.diff(self.time) > 0).all():
             raise InputError(f"{self.name}: the stamps of the reference do not rise.")
+        whole = whole_stamp(self.time[0]) if len(self.time) else 0.0
+        vars(self).update(time=self.time - whole, start=self.start + whole)
 
     def usable(self) -> Attitude:
         """Return the rows whose quaternion is one, of length one and without jumps of sign."""

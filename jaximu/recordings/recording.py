@@ -280,6 +280,15 @@ _SAME_RANGE = 0.05
 """Share by which two nominal scales of one range may differ: data sheets round, and gravity finds a sensor's own."""
 
 
+_ABSOLUTE = 1e8
+"""Seconds from which on a stamp counts from an epoch, and not from when a logger was switched on: three years."""
+
+
+def whole_stamp(first: float) -> float:
+    """Return the whole seconds of the first of absolute stamps, from which they are to be counted; else zero."""
+    return float(np.floor(first)) if abs(first) > _ABSOLUTE else 0.0
+
+
 def _axes_words(axes: str | None) -> str:
     return "axes as they are (FLU)" if axes is None else f"axes {axes}"
 
@@ -293,7 +302,7 @@ class Recording(Result, Comparable, page="recording"):
     accelerometer, gyroscope, magnetometer: triads, m = 3, body axes.
     temperature, ambient_temperature: m = 1, degC. current: m = 1, A. table_angle: m = 1, rad. table_rate: m = 1, rad/s.
     attitude: m = 4, unit quaternion w, x, y, z from body to lab.
-    start: the logger's absolute stamp of t = 0, seconds.
+    start: the logger's absolute stamp of t = 0, seconds. Absolute stamps of signals are counted from the first one.
     notes: sentences about what reading it had to assume, and `Defect`s.
     reading: how its file was read; None where it was made in memory.
     """
@@ -311,6 +320,12 @@ class Recording(Result, Comparable, page="recording"):
     sources: tuple[Source, ...] = ()
     notes: tuple[str, ...] = ()
     reading: Reading | None = None
+
+    def __post_init__(self) -> None:
+        first = min((signal.time[0] for signal in self.signals.values() if len(signal)), default=0.0)
+        if whole := whole_stamp(first):
+            counted = {name: replace(signal, time=signal.time - whole) for name, signal in self.signals.items()}
+            vars(self).update(counted, start=self.start + whole)
 
     @property
     def signals(self) -> dict[str, Signal]:
