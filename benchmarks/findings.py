@@ -5,8 +5,9 @@ and refusals. What `jaximu diagnose` says of good recordings: `false_alarms.py`.
 
 Poses by hand come from `tests/hidden_effects.py`, which shares nothing with the library; rests and tables from the
 library's own simulation. Coarse steps are of 1/256 g and 1/14 °/s, as of chips of ten bits: there `data.quantisation`
-is true, as is scatter beyond the white noise, of rounding, or where biases drift: neither is counted. What is found in
-measured recordings is listed, and may be true. Of good recordings one in a hundred may have a finding by chance.
+is true, as is scatter beyond the white noise, of rounding, or where biases drift: neither is counted. Of good
+recordings one in a hundred may have a finding by chance. `--measured`: what is found in measured recordings, beside
+what is known of them.
 """
 
 import os
@@ -252,7 +253,10 @@ def of_measured(by_file: dict[str, list[list[tuple[str, str]]]]) -> Table:
 
 def main() -> None:
     """Measure, and keep the tables."""
-    options = arguments(__doc__)
+    options = arguments(__doc__, measured="measured recordings (needs JAXIMU_DATA), and nothing else")
+    if options.measured:
+        by_file = measured(Path(os.environ["JAXIMU_DATA"]))
+        return finish("findings_measured", [of_measured(by_file)], {"measured": by_file}, script="findings")
     units, fits = (2, 2) if options.small else (40, 20)
     fitted = [*HAND, *TABLE]
     tasks = [(kind, seed, seed < fits and kind in fitted) for kind in (*fitted, *REST) for seed in range(units)]
@@ -267,10 +271,6 @@ def main() -> None:
         table, figures[title] = shares(f"Findings in the {title} of good recordings, {count} of a kind", by_kind)
         tables.append(table)
     figures["texts"] = [[*task[:2], *map(list, [*both[0], *both[1]])] for task, both in results if any(both)]
-    if folder := os.environ.get("JAXIMU_DATA"):
-        by_file = measured(Path(folder))
-        tables.append(of_measured(by_file))
-        figures["measured"] = by_file
     finish("findings", tables, figures, keep=not options.small)
 
 
