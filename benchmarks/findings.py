@@ -242,7 +242,9 @@ def of_measured(by_file: dict[str, list[list[tuple[str, str]]]]) -> Table:
     )
     for known, (true, why) in KNOWN.items():
         of_each = [both for name, both in by_file.items() if name.startswith(known)]
-        counters = [Counter(name for both in of_each for name in {name for name, _ in both[part]}) for part in (0, 1)]
+        counters = [
+            Counter(name for both in of_each for name in sorted({name for name, _ in both[part]})) for part in (0, 1)
+        ]
         several = len(of_each) > 1
         texts = (", ".join(f"{name} {count}" if several else name for name, count in one.items()) for one in counters)
         names, expected = set(counters[0] | counters[1]), set(true.split(", ")) - {""}
