@@ -7,17 +7,23 @@ element by element, because under `jax.vmap` and `jax.jacfwd` stacks of small ma
 CPU.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
 from jaximu.ground.prefixes import running
 from jaximu.ground.tracing import array_module
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 Number = Float[Array, ""]
 Numbers = Float[Array, "..."]
@@ -48,6 +54,11 @@ def inverse_matrix(matrix: Matrix) -> Matrix:
     columns = [jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)]
     determinant = jnp.sum(a * columns[0], axis=-1)
     return jnp.stack(columns, axis=-1) / determinant[..., None, None]
+
+
+def rotations_of(quaternions: Any) -> Rotation:
+    """Return quaternions (..., 4), one after another, as rotations of SciPy."""
+    return scipy.spatial.transform.Rotation.from_quat(np.reshape(quaternions, (-1, 4)), scalar_first=True)
 
 
 def unit_vectors(vectors: Float[Array, "... m"]) -> Float[Array, "... m"]:

@@ -38,3 +38,9 @@ def submatrix(matrix, places) -> FloatArray:
 def root_or_zero(values):
     """Return the square roots of numbers that rounding may have made negative: of these, zero."""
     return np.sqrt(np.maximum(values, 0.0))
+
+
+def means_by_group(group, values, count=0) -> FloatArray:
+    """Return the means (groups, m) of values (n, m) over the group of each, `count` or more; else zero."""
+    sums = np.column_stack([np.bincount(group, column, count) for column in values.T])
+    return sums / np.maximum(np.bincount(group, minlength=count), 1)[:, None]

@@ -170,6 +170,10 @@ class Imu(eqx.Module):
         """Return the triads that are there, by name."""
         return {name: triad for name in SENSOR_UNITS if (triad := getattr(self, name)) is not None}
 
+    def triad(self, name: str) -> Triad:
+        """Return a triad that is there."""
+        return self.triads()[name]
+
     def all_effects(self) -> dict[tuple[str, int | None], Effect]:
         """Return all effects by owner and place, in the order of the unit's numbers."""
         owners = {name: triad.effects for name, triad in self.triads().items()} | {"setup": self.setup}

@@ -9,7 +9,8 @@ from jaximu.ground.errors import InputError
 from jaximu.simulation.protocols.base import Protocol
 from jaximu.simulation.protocols.course import Course, attitude_of
 
-_FACES = [sign * np.eye(3)[axis] for axis in range(3) for sign in (1.0, -1.0)]
+FACES = [sign * np.eye(3)[axis] for axis in range(3) for sign in (1.0, -1.0)]
+"""Directions of the axes, up and down."""
 _CORNERS = [np.array(signs) / np.sqrt(3) for signs in itertools.product((1.0, -1.0), repeat=3)]
 _EDGES = [
     np.array(signs) / np.sqrt(2)
@@ -23,9 +24,9 @@ def directions(count: int) -> list[tuple[np.ndarray, float]]:
 
     6: the faces of a cube up; 8: its corners; 12: its edges; 24: each face at four headings; 26: faces, edges, corners.
     """
-    schemes = {6: _FACES, 8: _CORNERS, 12: _EDGES, 26: _FACES + _EDGES + _CORNERS}
+    schemes = {6: FACES, 8: _CORNERS, 12: _EDGES, 26: FACES + _EDGES + _CORNERS}
     if count == 24:
-        return [(up, quarter * np.pi / 2) for up in _FACES for quarter in range(4)]
+        return [(up, quarter * np.pi / 2) for up in FACES for quarter in range(4)]
     if count not in schemes:
         raise InputError(f"protocol positions: count must be 6, 8, 12, 24 or 26, found {count}.")
     return [(up, 0.0) for up in schemes[count]]
