@@ -66,11 +66,11 @@ class SharedConditions(Conditions):
         mounted = jnp.broadcast_to(mounted, turned[1:].shape)
         others_turned = multiply(multiply(mounted, turned[1:]), conjugate(mounted))
         first_back = jnp.broadcast_to(conjugate(turned[0]), others_turned.shape)
-        twisted = jnp.sum(logarithm(multiply(first_back, others_turned)) * up[0, 1:], axis=-1)
+        twisted = (logarithm(multiply(first_back, others_turned)) * up[0, 1:]).sum(axis=-1)
         pose, turn = (mask[1:] & mask[0] for mask in (self.separate.pose, self.separate.turn))
         leaning = jnp.where(pose[..., None], leaning, 0.0).reshape(len(leaning) * poses * 2)
         twisted = jnp.where(turn, twisted, 0.0).reshape(len(twisted) * turns)
-        return jnp.concatenate([alone.reshape(-1), leaning, twisted])
+        return jnp.concatenate([alone.ravel(), leaning, twisted])
 
 
 def _stacked(board: Board) -> Imu:
@@ -117,8 +117,8 @@ def _about(board: Board, observations: Observations) -> tuple[SharedConditions, 
     poses, turns = observations.poses, observations.turns
     units, count, steps = (*poses.mask.shape, turns.mask.shape[1])
     pose, turn = (mask[1:] & mask[0] for mask in (poses.mask, turns.mask))
-    used = jnp.concatenate([used.reshape(-1), jnp.repeat(pose.reshape(-1), 2), turn.reshape(-1)]).astype(float)
-    group = jnp.concatenate([group.reshape(-1), jnp.zeros(2 * pose.size, int), jnp.ones(turn.size, int)])
+    used = jnp.concatenate([used.ravel(), pose.ravel().repeat(2), turn.ravel()]).astype(float)
+    group = jnp.concatenate([group.ravel(), jnp.zeros(2 * pose.size, int), jnp.ones(turn.size, int)])
 
     def moved(change):
         means, rests, last = change
@@ -138,10 +138,9 @@ def _about(board: Board, observations: Observations) -> tuple[SharedConditions, 
         (last, noise, turns.mask),
         (rests, poses.gyroscope_covariance, poses.mask),
     ):
-        real = covariance * mask[..., None, None]
-        measured += jnp.einsum("nupi,upij,mupj->nm", reaction, real, reaction)
+        measured += jnp.einsum("nupi,upij,mupj->nm", reaction, covariance * mask[..., None, None], reaction)
         roots = jax.vmap(mean_root)(covariance, mask)
         factors.append(jnp.einsum("nupi,uij->nupj", reaction, roots).reshape(len(used), -1))
-    back = jnp.concatenate([jnp.eye(3)[None], rotation_matrix(exponential(_mountings(board))).swapaxes(1, 2)])
+    back = jnp.concatenate([jnp.eye(3)[None], rotation_matrix(exponential(_mountings(board))).mT])
     together = jnp.einsum("nuti,uij,jk->ntk", last, back, mean_root(noise[0], turns.mask[0]))
     return conditions, Covariance(measured, (*factors, together.reshape(len(used), -1)), used, group)

@@ -30,6 +30,7 @@ from jaximu.ground.array_types import Array, FloatArray, IntArray
 from jaximu.ground.differences import interpolated, midpoints
 from jaximu.ground.rotation import (
     UP,
+    Matrix,
     Number,
     conjugate,
     exponential,
@@ -42,6 +43,7 @@ from jaximu.ground.rotation import (
     unit_vectors,
 )
 from jaximu.ground.tracing import array_module
+from jaximu.ground.vectors import root_or_zero
 from jaximu.model.effects import Effect
 from jaximu.model.effects.reference_filter import behind
 from jaximu.model.mounting import MOUNTING_EFFECTS, Mounting
@@ -98,14 +100,13 @@ class AttitudeConditions(Conditions):
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the errors of the rotations (rad) and of the mean forces (m/s²)."""
-        change = imu.triads()["gyroscope"].inverse() - self.linear
+        change = imu.triad("gyroscope").inverse() - self.linear
         moved = jnp.einsum("tijk,jk->ti", self.slope, change)
         error = logarithm(multiply(conjugate(self.target), multiply(self.rotation, exponential(moved))))
         force = jnp.einsum("wijk,jk->wi", self.force, imu.accelerometer.inverse()) - self.gain
-        force = force + jnp.einsum("wijk,jk->wi", self.swung, change)
-        force = force - self.magnitude * UP
+        force += jnp.einsum("wijk,jk->wi", self.swung, change) - self.magnitude * UP
         error, force = error * self.turn[:, None], force * self.window[:, None]
-        return jnp.concatenate([error.reshape(-1), force.reshape(-1)])
+        return jnp.concatenate([error.ravel(), force.ravel()])
 
 
 class Reactions(eqx.Module):
@@ -175,7 +176,7 @@ class Intervals(eqx.Module):
 
 def _smoothed(imu: Imu, mounting: Mounting, data: Intervals, stamps: Float[Array, " k"]) -> Float[Array, "k 4"]:
     """Return the rotations by which the unit stands behind what a smoothed reference says, at times of the log."""
-    time, matrix = (data.since + data.until) / 2, imu.triads()["gyroscope"].inverse()[:, :3]
+    time, matrix = (data.since + data.until) / 2, imu.triad("gyroscope").inverse()[:, :3]
     acceleration, jerk = (interpolated(time, slope, stamps) @ matrix.T for slope in (data.slope, data.curve))
     return exponential(behind(mounting.filter_variance, acceleration, jerk))
 
@@ -194,7 +195,7 @@ def _added(imu: Imu, data: Intervals, around: Stimulus) -> dict[str, Float[Array
     bare, time = imu.with_effects(), (data.since + data.until) / 2
     outputs = {"accelerometer": jnp.zeros_like(data.force), "gyroscope": jnp.zeros_like(data.rate)}
     for _ in range(2):
-        turning = bare.triads()["gyroscope"].recover(data.rate - outputs["gyroscope"])
+        turning = bare.triad("gyroscope").recover(data.rate - outputs["gyroscope"])
         inner = (turning[2:] - turning[:-2]) / (time[2:] - time[:-2])[:, None]
         stimulus = replace(
             around,
@@ -224,7 +225,7 @@ def evaluated(
     mounting: Mounting,
     data: Intervals,
     samples: Int[Array, "T S"],
-    noise: Float[Array, "3 3"],
+    noise: Matrix,
     group: int,
 ):
     """Return the conditions about a unit, rotations' white noise (T, 3, 3), times (T,), and reactions.
@@ -235,31 +236,32 @@ def evaluated(
     **Arguments:** `imu`: without effects; `mounting`: of the reference; `samples`: samples of each interval, with some
     beside it; `noise`: density of the gyroscope's, output² s; `group`: intervals to a window of the force.
     """
-    gyroscope, accelerometer = imu.triads()["gyroscope"], imu.accelerometer
-    stamps = mounting.on_log(data.stamp)
+    gyroscope, accelerometer = imu.triad("gyroscope"), imu.accelerometer
     held = _held(mounting, data, samples)
     turning, sensed = data.rate[samples], data.force[samples]
     whole = preintegrate_samples(gyroscope.recover(turning), accelerometer.recover(sensed), held)
     inverse = gyroscope.inverse()[:, :3]
     spread = white_covariance(whole.reaction[..., :3, :3], inverse @ noise @ inverse.T, held)
-    true = multiply(multiply(data.attitude, mounting.turned), _smoothed(imu, mounting, data, stamps))
+    true = multiply(
+        multiply(data.attitude, mounting.turned), _smoothed(imu, mounting, data, mounting.on_log(data.stamp))
+    )
     before, after = true[:-1], true[1:]
     target = multiply(conjugate(before), after)
     turn_slope, swung = jnp.split(linear_slope(whole.reaction[..., :6, :3], turning), 2, axis=1)
     slope = linear_slope(whole.reaction[..., 3:6, 3:], sensed)
     sculled = whole.velocity - jnp.einsum("tijk,jk->ti", slope, accelerometer.inverse())
     upright = rotation_matrix(multiply(mounting.tilted, before))
-    duration = jnp.sum(held, axis=1) * data.used
+    duration = held.sum(axis=1) * data.used
     windows = len(samples) // group
-    total = jnp.sum(duration.reshape(windows, group), axis=1)
-    complete = jnp.all(data.used.reshape(windows, group), axis=1) & (total > 0)
+    total = duration.reshape(windows, group).sum(axis=1)
+    complete = data.used.reshape(windows, group).all(axis=1) & (total > 0)
     safe = jnp.where(complete, total, 1.0)
-    share = upright * (jnp.repeat(complete / safe, group) * data.used)[:, None, None]
+    share = upright * ((complete / safe).repeat(group) * data.used)[:, None, None]
 
     def by_window(parts):
-        return jnp.sum(jnp.einsum("tai,ti...->ta...", share, parts).reshape(windows, group, *parts.shape[1:]), axis=1)
+        return jnp.einsum("tai,ti...->ta...", share, parts).reshape(windows, group, *parts.shape[1:]).sum(axis=1)
 
-    gained = rotate(mounting.tilted, jnp.sum(data.velocity.reshape(windows, group, 3), axis=1))
+    gained = rotate(mounting.tilted, data.velocity.reshape(windows, group, 3).sum(axis=1))
     conditions = AttitudeConditions(
         whole.rotation,
         target,
@@ -272,7 +274,7 @@ def evaluated(
         complete,
         data.gravity,
     )
-    leaning = share @ jnp.cross(jnp.eye(3), whole.velocity[:, None]).swapaxes(1, 2)
+    leaning = share @ jnp.cross(jnp.eye(3), whole.velocity[:, None]).mT
     turned = whole.reaction[..., :3, :] * data.used[:, None, None, None]
     reaction = jnp.concatenate([turned, share[:, None] @ whole.reaction[..., 3:6, :]], axis=-2)
     rows = [part.swapaxes(1, 2).reshape(len(samples), 6, -1) for part in jnp.split(reaction, 2, axis=-1)]
@@ -299,7 +301,7 @@ def _of_ends(ends: Sequence[tuple[IntArray, Array]], starts: Sequence[tuple[IntA
     rows = [np.pad(rows, (there, (0, 0)), mode="edge") for (rows, _), there in zip(parts, beside, strict=True)]
     numerics = array_module([values for _, values in parts])
     values = [numerics.pad(part, (there, (0, 0), (0, 0))) for (_, part), there in zip(parts, beside, strict=True)]
-    return BlockFactor(np.concatenate(rows, axis=1), numerics.concatenate(values, axis=1))
+    return BlockFactor(np.hstack(rows), numerics.hstack(values))
 
 
 @dataclass(frozen=True)
@@ -334,9 +336,8 @@ class AgainstAttitude(OfOneUnit):
         holes = np.cumulative_sum(missing, include_initial=True)
         used = (np.diff(np.interp(stamps[knots], time, gaps)) == 0) & (np.diff(holes[knots]) == 0)
         used &= ~np.isin(np.arange(count) // group, self.left_out)
-        velocity = attitude.velocities()
         gained = np.zeros((size, 3))
-        if velocity is not None:
+        if (velocity := attitude.velocities()) is not None:
             gained[:count] = np.diff(velocity[knots], axis=0)
         knots = np.pad(knots, (0, size - count), mode="edge")
         slope, curve = _slopes(time, gyroscope.values)
@@ -373,10 +374,10 @@ class AgainstAttitude(OfOneUnit):
         """Samples (T, S) of each interval, with some more on either side for the delay to move."""
         data = self.intervals
         stamps = mounting.on_log(data.stamp)
-        first = np.searchsorted(data.until, stamps[:-1]) - _MARGIN
-        longest = np.searchsorted(data.until, stamps[1:]) - first + _MARGIN
+        first = data.until.searchsorted(stamps[:-1]) - _MARGIN
+        longest = data.until.searchsorted(stamps[1:]) - first + _MARGIN
         size = -(-int(longest[data.used].max()) // _BUCKET) * _BUCKET
-        return np.clip(first[:, None] + np.arange(size), 0, len(data.until) - 1)
+        return (first[:, None] + np.arange(size)).clip(0, len(data.until) - 1)
 
     def unsmoothed(self, imu: Imu) -> Attitude:
         """Return the reference as it would be without the filter that a fitted unit's set-up says it has."""
@@ -387,9 +388,8 @@ class AgainstAttitude(OfOneUnit):
 
     def densities(self) -> tuple[FloatArray, float]:
         """White noise of the gyroscope (3, 3), output² s, and of the accelerometer, (m/s²)² s."""
-        if self.noise is None or self.noise.gyroscope is None:
-            white, force = np.full(3, (_KNOWN * _UNITS[0]) ** 2), (_KNOWN * _UNITS[3]) ** 2
-        else:
+        white, force = np.full(3, (_KNOWN * _UNITS[0]) ** 2), (_KNOWN * _UNITS[3]) ** 2
+        if self.noise is not None and self.noise.gyroscope is not None:
             white, force = self.noise.gyroscope.split(0.25)[0], float(self.noise.accelerometer.split(0.25)[0].mean())
         return np.diag(white * self.recording.signals["gyroscope"].nominal_scale ** 2), force
 
@@ -412,11 +412,10 @@ class AgainstAttitude(OfOneUnit):
 
     def rows(self, imu: Imu) -> Rows:
         """Return what each condition is: three of each rotation, then three of each window's mean force."""
-        data, group = self.intervals, self.group
-        stamps, used = data.stamp, data.used
+        stamps, used, group = self.intervals.stamp, self.intervals.used, self.group
         ends = stamps[::group]
         window = np.arange(len(ends) - 1)
-        observation = np.repeat(np.concatenate([np.repeat(window, group), window]), 3)
+        observation = np.concatenate([window.repeat(group), window]).repeat(3)
         middle = np.concatenate([midpoints(stamps), midpoints(ends)])
         rotations = (np.arange(len(middle)) < len(used))[:, None]
         signals = self.recording.signals
@@ -431,10 +430,10 @@ class AgainstAttitude(OfOneUnit):
             kind=np.repeat([1, 0], [3 * len(used), 3 * len(window)]),
             first=observation,
             last=observation,
-            to_si=np.repeat(1 / length, 3),
-            used=np.repeat(np.concatenate([used, used.reshape(-1, group).all(axis=1)]), 3),
-            covariates={name: np.repeat(values, 3) for name, values in covariates.items()},
-            spans=np.stack([ends[:-1], ends[1:]], axis=1),
+            to_si=(1 / length).repeat(3),
+            used=np.concatenate([used, used.reshape(-1, group).all(axis=1)]).repeat(3),
+            covariates={name: values.repeat(3) for name, values in covariates.items()},
+            spans=self.spans()[0],
             observation="motion",
         )
 
@@ -484,7 +483,7 @@ class AgainstAttitude(OfOneUnit):
             if not _stands(effect):
                 mine, columns = np.split(columns, [size], axis=1)
             parted.append(mine)
-        columns = free_columns(effects, np.concatenate(parted, axis=1))
+        columns = free_columns(effects, np.hstack(parted))
         covariance = self._covariance(conditions, spread, duration, leaning, white)
         return About(conditions, covariance, columns, details=AttitudeDetails(duration, reactions, self, imu))
 
@@ -534,7 +533,7 @@ class AgainstAttitude(OfOneUnit):
     def spans(self) -> list[FloatArray]:
         """Return start and stop (k, 2), s, of the windows of the specific force."""
         ends = self.intervals.stamp[:: self.group]
-        return [np.stack([ends[:-1], ends[1:]], axis=1)]
+        return [np.column_stack([ends[:-1], ends[1:]])]
 
     def rests(self) -> list[FloatArray]:
         """Return none: the unit is in motion, and its noise is the fit's."""
@@ -550,8 +549,7 @@ class AgainstAttitude(OfOneUnit):
             along = np.einsum("ij,mk->mijk", np.eye(3), shape).reshape(len(shape), 3, -1)
             return np.asarray(details.reactions.react({triad: along}, windows))
 
-        share = (np.asarray(stimulus.time) - stamps[0]) / np.ptp(stamps)
-        return Observed(react, share, up=unit_vectors(force))
+        return Observed(react, (np.asarray(stimulus.time) - stamps[0]) / np.ptp(stamps), up=unit_vectors(force))
 
     def without(self, observation: int) -> AgainstAttitude:
         """Return the recording with a window of the force left out, and the rotations in it."""
@@ -568,30 +566,29 @@ class AgainstAttitude(OfOneUnit):
         """White noise that is known, and the components of what is not."""
         turn, window = conditions.turn, conditions.window
         turns, windows = len(turn), len(window)
-        total = duration.reshape(windows, -1).sum(axis=1)
-        total = np.where(window, total, 1.0)
+        total = np.where(window, duration.reshape(windows, -1).sum(axis=1), 1.0)
         n = 3 * (turns + windows)
         rows, later = np.arange(3 * turns).reshape(turns, 3), 3 * turns + np.arange(3 * windows).reshape(windows, 3)
         measured = np.zeros((n, n))
         measured[rows[:, :, None], rows[:, None, :]] = spread
         measured[later, later] = (white / total)[:, None]
-        used = np.concatenate([np.repeat(turn, 3), np.repeat(window, 3)]).astype(float)
-        measured *= used[:, None] * used
+        used = np.concatenate([turn.repeat(3), window.repeat(3)]).astype(float)
+        measured *= np.outer(used, used)
 
         def placed(rows, factor):
             whole = np.zeros((n, *factor.shape[1:]))
             whole[rows.ravel()] = factor
             return (whole.T * used).T
 
-        back = np.asarray(rotation_matrix(conditions.target)).swapaxes(1, 2)
-        step = np.sqrt(np.maximum(duration, 0.0))
+        back = np.asarray(rotation_matrix(conditions.target)).mT
+        step = root_or_zero(duration)
         walk = np.kron(np.tril(np.ones((turns, turns))) * step * duration[:, None], np.eye(3))
         mean = np.eye(3) / total[:, None, None]
         factors = (
-            placed(rows, np.repeat(step, 3)) * _UNITS[0],
+            placed(rows, step.repeat(3)) * _UNITS[0],
             shared_ends(back, leaning, windows).of_rows(_UNITS[1] * used),
             placed(rows, walk) * _UNITS[2],
-            placed(later, np.repeat(total**-0.5, 3)) * _UNITS[3],
+            placed(later, (total**-0.5).repeat(3)) * _UNITS[3],
             _of_ends([(later, mean)], [(later, -mean)]).of_rows(_UNITS[4] * used),
         )
         return Covariance(measured, factors, used, np.repeat([0, 3], [3 * turns, 3 * windows]))
@@ -603,8 +600,7 @@ class AgainstAttitude(OfOneUnit):
         values = np.asarray(conditions(imu.with_effects()))
         turn, window = conditions.turn, conditions.window
         rate = values[: 3 * len(turn)].reshape(-1, 3)[turn] / about.details.duration[turn, None]
-        stamps = self.intervals.stamp
-        middle = midpoints(stamps)
+        middle = midpoints(self.intervals.stamp)
         forces = values[3 * len(turn) :].reshape(-1, 3)[window]
         return {
             "rotation": (middle[turn], np.degrees(rate), "deg/s"),
@@ -614,5 +610,5 @@ class AgainstAttitude(OfOneUnit):
 
 def _slopes(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return first and second derivative of values (m, 3), each of lines through `_SMOOTH` seconds."""
-    slope = np.stack([smoothed_slope(time, axis, _SMOOTH) for axis in values.T], axis=1)
-    return slope, np.stack([smoothed_slope(time, axis, _SMOOTH) for axis in slope.T], axis=1)
+    slope = np.column_stack([smoothed_slope(time, axis, _SMOOTH) for axis in values.T])
+    return slope, np.column_stack([smoothed_slope(time, axis, _SMOOTH) for axis in slope.T])

@@ -112,7 +112,7 @@ class RecordedByHand(OfOneUnit):
 
     def counts(self) -> dict[str, int]:
         """Return the numbers of poses and turns."""
-        return {name: int(np.sum(getattr(self.observations, name).mask)) for name in ("poses", "turns")}
+        return {name: int(getattr(self.observations, name).mask.sum()) for name in ("poses", "turns")}
 
     def rate_at_rest(self) -> FloatArray:
         """Return the gyroscope's mean output (3,) over the poses."""
@@ -203,7 +203,7 @@ class RecordedByHand(OfOneUnit):
         """Return how the conditions (n,) change by that."""
         turns = np.einsum("tasi,tsi->ta", details.reaction.turn, -bend(self.observations.turns)).ravel()
         count = len(self.observations.poses.mask)
-        return np.concatenate([np.zeros(count), turns, np.zeros(3 * count)])
+        return np.pad(turns, (count, 3 * count))
 
     def twin(self, imu: Imu, details: Along, conditions: FloatArray, noise: NoiseModel, seed: int) -> RecordedByHand:
         """Return the recordings as a unit without effects would have them, along the same motion, noise included."""
@@ -235,6 +235,5 @@ def _attitudes(tracks: Sequence[dict[str, Track]], poses: int) -> FloatArray:
     for track in (pair["gyroscope"] for pair in tracks):
         pose, row = np.unique(track.observation, return_index=True)
         inside = pose < poses
-        attitude = np.asarray(track.stimulus.attitude)[row[inside]]
-        axes[pose[inside]] = rotation_matrix(attitude).reshape(-1, 9)
+        axes[pose[inside]] = rotation_matrix(np.asarray(track.stimulus.attitude)[row[inside]]).reshape(-1, 9)
     return axes

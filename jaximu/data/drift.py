@@ -78,7 +78,7 @@ def slow_units(known: AxisNoise, shortest: float, duration: float) -> dict[str, 
 def with_noise(noise: NoiseModel, triad: str, more: AxisNoise) -> NoiseModel:
     """Return a noise model with further slow noise of a triad."""
     known = getattr(noise, triad)
-    variance = np.concatenate([known.variance, more.variance], axis=1)
+    variance = np.hstack([known.variance, more.variance])
     times = np.concatenate([known.correlation_time, more.correlation_time])
     return replace(noise, **{triad: replace(known, variance=variance, correlation_time=times)})
 
@@ -95,7 +95,7 @@ def with_usual_drift(noise: NoiseModel, shortest: float, duration: float) -> Noi
 def power_on_text(units: Mapping[str, AxisNoise], sizes: Mapping[str, float]) -> list[str]:
     """Say how a bias changes from recording to recording, where it does; `sizes` of the drifts `units`, by name."""
     changes = {
-        name.removesuffix(_POWER_ON): size(sizes[name] * float(np.sqrt(np.mean(unit.variance))), "m/s^2", 2)
+        name.removesuffix(_POWER_ON): size(sizes[name] * float(np.sqrt(unit.variance.mean())), "m/s^2", 2)
         for name, unit in units.items()
         if name.endswith(_POWER_ON)
     }
@@ -125,7 +125,7 @@ def with_drift(
     by_conditions[:, used] = -total / sizes @ np.linalg.solve(weighted, jacobian[used]).T
     sentences: tuple[str, ...] = ()
     if noise is None:
-        present = [submatrix(whole.component(k), used) for k in range(len(excess)) if np.any(whole.group[used] == k)]
+        present = [submatrix(whole.component(k), used) for k in range(len(excess)) if (whole.group[used] == k).any()]
         bare = submatrix(whole.measured, used)
         estimated = estimated_drift(residual[used], jacobian[used], bare, present, means, used)
         total = total + by_conditions[:, used] @ (estimated.covariance - weighted) @ by_conditions[:, used].T
@@ -242,7 +242,7 @@ def drift_components(
                 np.zeros(3), np.zeros(3), known.covariance([0.0], [1.0])[:, 0], np.array([_FOREVER])
             )
         for kind, unit in drifts.items():
-            slow = np.square(means.scale[triad])[:, None, None] * unit.covariance(start, stop)
+            slow = (means.scale[triad] ** 2)[:, None, None] * unit.covariance(start, stop)
             slow *= which[:, None] == which
             units[f"{triad} {kind}"] = unit
             covariances.append(np.einsum("npi,ipq,mqi->nm", by_output, slow, by_output, optimize=True)[None])
@@ -265,7 +265,7 @@ def means_by_hand(
     scatter = {name: np.asarray(getattr(poses, f"{name}_covariance"))[real] for name in reactions}
     variances = {name: variances_of(covariance) for name, covariance in scatter.items()}
     start, stop = np.asarray(poses.start)[real], np.asarray(poses.stop)[real]
-    return OutputMeans.of(start, stop, np.repeat(np.arange(len(counts)), counts)[real], reactions, scales, variances)
+    return OutputMeans.of(start, stop, np.arange(len(counts)).repeat(counts)[real], reactions, scales, variances)
 
 
 def mean_output_reactions(reaction: Sensitivities) -> tuple[FloatArray, FloatArray]:
@@ -275,18 +275,14 @@ def mean_output_reactions(reaction: Sensitivities) -> tuple[FloatArray, FloatArr
     """
     norm, after, before, turn = map(np.asarray, (reaction.norm, reaction.after, reaction.before, reaction.turn))
     poses = len(norm)
-    conditions = poses + 2 * (poses - 1) + 3 * poses
-    by_force, by_rate = np.zeros((conditions, poses, 3)), np.zeros((conditions, poses, 3))
-    pose, step = np.arange(poses), np.arange(poses - 1)
-    by_force[pose, pose] = norm
-    half = turn.sum(axis=2) / 2
-    for component in range(2):
-        rows = poses + 2 * step + component
-        by_force[rows, step + 1] = after[:, component]
-        by_force[rows, step] = before[:, component]
-        by_rate[rows, step + 1] = by_rate[rows, step] = half[:, component]
-    rest = poses + 2 * (poses - 1) + 3 * pose[:, None] + np.arange(3)
-    by_rate[rest, pose[:, None]] = np.eye(3)
+    at_rest = poses + 2 * (poses - 1)
+    by_force, by_rate = np.zeros((2, at_rest + 3 * poses, poses, 3))
+    pose, step = np.arange(poses)[:, None], np.arange(poses - 1)[:, None]
+    by_force[pose, pose] = norm[:, None]
+    rows = poses + 2 * step + np.arange(2)
+    by_force[rows, step + 1], by_force[rows, step] = after, before
+    by_rate[rows, step + 1] = by_rate[rows, step] = turn.sum(axis=2) / 2
+    by_rate[at_rest + 3 * pose + np.arange(3), pose] = np.eye(3)
     return by_force, by_rate
 
 
@@ -326,8 +322,8 @@ def restricted_likelihood(
         slope = 0.5 * (reached @ pulled - sizes * np.tensordot(components, projector, 2))
         curvature = 0.5 * reached @ projector @ reached.T + np.diag(known + np.maximum(-slope, 0.0))
         step = np.linalg.solve(curvature, slope - known * (log_size - mean))
-        step /= max(1.0, float(np.max(np.abs(step))) / _FARTHEST)
-        while np.max(np.abs(step)) > _STILL:
+        step /= max(1.0, float(abs(step).max()) / _FARTHEST)
+        while abs(step).max() > _STILL:
             value, *there = at(log_size + step)
             if value >= best:
                 break
@@ -346,6 +342,6 @@ def _projector(covariance: FloatArray, jacobian: FloatArray) -> tuple[FloatArray
     white = np.linalg.inv(root)
     basis = white @ jacobian
     inner = np.linalg.cholesky(basis.T @ basis)
-    volume = 2 * float(np.sum(np.log(np.diagonal(root))) + np.sum(np.log(np.diagonal(inner))))
+    volume = 2 * float(np.log(np.diagonal(root)).sum() + np.log(np.diagonal(inner)).sum())
     across = np.linalg.solve(inner, basis.T @ white)
     return white.T @ white - across.T @ across, volume

@@ -29,7 +29,16 @@ from jaximu.estimation.track import Track, added
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
 from jaximu.ground.distributions import rms, robust_sigma
-from jaximu.ground.rotation import Number, exponential, inverse_matrix, rotate, unit_vectors
+from jaximu.ground.rotation import (
+    IDENTITY,
+    Number,
+    Vector,
+    exponential,
+    inverse_matrix,
+    rotate,
+    rotations_of,
+    unit_vectors,
+)
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.ground.vectors import dot_rows, lengths_of
 from jaximu.model.sensor import Imu
@@ -71,7 +80,7 @@ class FieldConditions(Conditions):
     slope: Float[Array, "n 3 3 4"]
     carried: Float[Array, "n 3 3"]
     swept: Float[Array, "n 3 3"]
-    origin: Float[Array, " 3"]
+    origin: Vector
     basis: Float[Array, "n 2 3"]
     up: Float[Array, "n 3"]
     window: Bool[Array, " n"]
@@ -83,7 +92,7 @@ class FieldConditions(Conditions):
 
     def field(self, imu: Imu) -> Float[Array, "n 3"]:
         """Return the field (µT) of each window in its own body frame."""
-        return jnp.einsum("nijk,jk->ni", self.slope, imu.triads()["magnetometer"].inverse())
+        return jnp.einsum("nijk,jk->ni", self.slope, imu.triad("magnetometer").inverse())
 
     def __call__(self, imu: Imu) -> Float[Array, " 4*n"]:
         """Return the errors of the strength, of both components across the field, and of the sine of its dip."""
@@ -91,7 +100,7 @@ class FieldConditions(Conditions):
 
     def of(self, imu: Imu, field: Float[Array, "n 3"]) -> Float[Array, " 4*n"]:
         """Return the same errors of any field (µT) of the windows."""
-        length = jnp.sqrt(jnp.sum(field**2, axis=-1) + 1e-24)
+        length = jnp.sqrt((field**2).sum(axis=-1) + 1e-24)
         norm = jnp.where(self.window, length - self.magnitude, 0.0)
         if self.alone:
             return norm
@@ -99,10 +108,9 @@ class FieldConditions(Conditions):
         if imu.gyroscope is not None:
             rate = inverse_matrix(imu.gyroscope.gain) @ (self.origin - imu.gyroscope.bias)
             carried = rotate(exponential(self.swept @ rate), carried)
-        moved = carried - field
-        across = jnp.where(self.turn[:, None], jnp.einsum("nci,ni->nc", self.basis, moved), 0.0)
-        dip = jnp.where(self.level, jnp.sum(self.up * field, axis=-1) / length + self.sine, 0.0)
-        return jnp.concatenate([norm, across.reshape(-1), dip])
+        across = jnp.where(self.turn[:, None], jnp.einsum("nci,ni->nc", self.basis, carried - field), 0.0)
+        dip = jnp.where(self.level, (self.up * field).sum(axis=-1) / length + self.sine, 0.0)
+        return jnp.concatenate([norm, across.ravel(), dip])
 
 
 class FieldSamples(eqx.Module):
@@ -119,7 +127,7 @@ class FieldSamples(eqx.Module):
     @partial(stored.compiled, quick=True)
     def added(self, imu: Imu) -> Float[Array, "n S 3"]:
         """Return what the effects of a unit's magnetometer add to its output (output units)."""
-        field = imu.triads()["magnetometer"].recover(self.output, self.track.stimulus)
+        field = imu.triad("magnetometer").recover(self.output, self.track.stimulus)
         stimulus = replace(self.track.stimulus, magnetic_field=field)
         return added(imu, {"magnetometer": replace(self.track, stimulus=stimulus)})["magnetometer"]
 
@@ -191,18 +199,22 @@ class FieldWindows:
         """Whether there is no other sensor to compare with."""
         return not (self.turn.any() or self.level.any())
 
+    def placed(self, strength: NDArray[Any], turn: NDArray[Any], dip: NDArray[Any]) -> NDArray[Any]:
+        """Return numbers (n,) of strengths, turns and dips in the order of the conditions, of which a turn has two."""
+        return strength if self.alone else np.concatenate([strength, turn.repeat(2), dip])
+
     def field(self, imu: Imu) -> FloatArray:
         """Return the field (n, 3), µT, that a unit's magnetometer makes of each window, in its body frame there."""
-        return np.einsum("nijk,jk->ni", self.along(imu).slope, imu.triads()["magnetometer"].inverse())
+        return np.einsum("nijk,jk->ni", self.along(imu).slope, imu.triad("magnetometer").inverse())
 
     def added(self, imu: Imu) -> FloatArray:
         """Return what the effects of a unit's magnetometer add to each sample's output (n, S, 3), output units."""
-        affected = imu.triads()["magnetometer"].effects
+        affected = imu.triad("magnetometer").effects
         return np.asarray(self.samples.added(imu)) if affected else np.zeros_like(self.samples.output)
 
     def along(self, imu: Imu) -> FieldWindows:
         """Return the same with what a unit's effects add taken off the samples."""
-        if not imu.triads()["magnetometer"].effects:
+        if not imu.triad("magnetometer").effects:
             return self
         slope = np.array(self.slope)
         slope[..., :3] -= np.asarray(self.samples.mean_added(imu))
@@ -216,9 +228,8 @@ class FieldWindows:
     def bent(self, field: FloatArray) -> FloatArray:
         """Return how the sine (n,) of the angle from up to a field (n, 3) reacts to what `vertical` is of, (n, 12)."""
         along = unit_vectors(field)
-        across = along - np.sum(along * self.up, axis=1, keepdims=True) * self.up
-        by_gain = np.einsum("ni,nj->nij", across, self.up).reshape(len(self), 9)
-        return np.concatenate([by_gain, across], axis=1)
+        across = along - (along * self.up).sum(axis=1, keepdims=True) * self.up
+        return np.hstack([np.einsum("ni,nj->nij", across, self.up).reshape(len(self), 9), across])
 
     def without(self, left_out: BoolArray) -> FieldWindows:
         """Return the same with some windows left out (n,)."""
@@ -260,10 +271,9 @@ def windows_of(
         if other is not None:
             inside &= (time >= other.time[0]) & (time <= other.time[-1])
     time, values = time[inside], values[inside]
-    edges = _edges(time, values, signal.rate, _MOST if gyroscope is not None else _MOST_ALONE)
-    longest = _MEAN if gyroscope is not None else _MEAN_ALONE
-    size = max(1, signal.samples(longest))
-    stops = np.minimum(edges[1:], edges[:-1] + size)
+    most, longest = (_MOST_ALONE, _MEAN_ALONE) if gyroscope is None else (_MOST, _MEAN)
+    edges = _edges(time, values, signal.rate, most)
+    stops = np.minimum(edges[1:], edges[:-1] + max(1, signal.samples(longest)))
     count = stops - edges[:-1]
     index = np.minimum(edges[:-1, None] + np.arange(count.max()), stops[:, None] - 1)
     weight = (np.arange(count.max()) < count[:, None]) / count[:, None]
@@ -275,7 +285,7 @@ def windows_of(
     if motion is not None:
         mean = np.einsum("ns,nsij,nsj->ni", weight, turned, motion.accelerometer.at(time[index]))
         length = lengths_of(mean)
-        up, off = mean / length[:, None], np.abs(length / STANDARD_GRAVITY - 1)
+        up, off = mean / length[:, None], abs(length / STANDARD_GRAVITY - 1)
     known = {} if motion is None else motion.signals
     known = {name: part.at(time[index]) for name, part in known.items()}
     warm, flow = (known[name][..., 0] if name in known else None for name in ("temperature", "current"))
@@ -292,7 +302,7 @@ def windows_of(
         up,
         off,
         angle,
-        np.stack([time[edges[:-1]], time[edges[1:] - 1]], axis=1),
+        np.column_stack([time[edges[:-1]], time[edges[1:] - 1]]),
         count.astype(float),
         everywhere,
         following if gyroscope is not None else ~everywhere,
@@ -348,7 +358,7 @@ def _carried(gyroscope: Signal):
     padding = (0, (1 << count.bit_length()) - count)  # few shapes are compiled
     rates, held = np.pad(gyroscope.values, (padding, (0, 0))), np.pad(np.diff(edges), padding)
     running, sweep = (leaf[:count] for leaf in stored.call(turned_by_rates, "carried attitude", rates, held))
-    frames = scipy.spatial.transform.Rotation.from_quat(np.vstack([[1.0, 0.0, 0.0, 0.0], running]), scalar_first=True)
+    frames = rotations_of(np.vstack([IDENTITY, running]))
     swept = np.cumulative_sum(sweep.reshape(-1, 9), axis=0, include_initial=True)
     reached = scipy.interpolate.make_interp_spline(edges, swept, k=1)
     return scipy.spatial.transform.Slerp(edges, frames), lambda times: reached(times).reshape(-1, 3, 3)
@@ -380,21 +390,15 @@ class MagneticField(OfOneUnit):
         windows, count = self.windows, len(self.windows)
         window = np.arange(count)
         middle = windows.time.mean(axis=1)
-
-        def placed(of_windows: NDArray[Any], of_turns: NDArray[Any]) -> NDArray[Any]:
-            parts = [of_windows, np.repeat(of_turns, 2), of_windows]
-            return parts[0] if windows.alone else np.concatenate(parts)
-
-        kind = placed(np.zeros(count, np.int64), np.ones(count, np.int64))
-        kind[3 * count :] = 2
+        kind = windows.placed(*np.arange(3).repeat(count).reshape(3, count))
         return Rows(
             kinds=RESIDUALS,
             kind=kind,
-            first=placed(window, window),
-            last=placed(window, (window + 1) % count),
+            first=windows.placed(window, window, window),
+            last=windows.placed(window, (window + 1) % count, window),
             to_si=np.ones(len(kind)),
-            used=np.concatenate([windows.used, np.repeat(windows.turn, 2), windows.level])[: len(kind)],
-            covariates={TIME: placed(middle, middle)},
+            used=windows.placed(windows.used, windows.turn, windows.level),
+            covariates={TIME: windows.placed(middle, middle, middle)},
             spans=windows.time,
             observation="window",
         )
@@ -447,23 +451,23 @@ class MagneticField(OfOneUnit):
         window = np.arange(n)
         # what a window's field reaches: its norm, the turns after and before it, its angle to the vertical
         turns, before = n + 2 * window[:, None] + np.arange(2), (window - 1) % n
-        places = np.concatenate([window[:, None], turns, turns[before], 3 * n + window[:, None]], axis=1)
+        places = np.hstack([window[:, None], turns, turns[before], 3 * n + window[:, None]])
         carried = (basis @ windows.carried)[before]
         level = (windows.up - dot_rows(windows.up, along)[:, None] * along) / length[:, None]
-        values = np.concatenate([along[:, None], -basis, carried, level[:, None]], axis=1)
-        used = np.concatenate([windows.used, np.repeat(windows.turn, 2), windows.level]).astype(float)
-        rows, kinds = (n, slice(1)) if windows.alone else (4 * n, slice(None))
-        used, places = used[:rows], places[:, kinds]
+        values = np.hstack([along[:, None], -basis, carried, level[:, None]])
+        rows = self.rows(imu)
+        used, group = rows.used.astype(float), rows.kind
+        kinds = slice(1 if windows.alone else None)
+        places = places[:, kinds]
         values = values[:, kinds] * used[places][..., None]
-        inverse = np.linalg.inv(imu.triads()["magnetometer"].gain)
+        inverse = np.linalg.inv(imu.triad("magnetometer").gain)
         shaken = BlockFactor(places, values * (windows.noise / np.sqrt(windows.count))[:, None, None] @ inverse)
         turned = _UNITS[1] * (1 + _TURN_SHARE / _UNITS[1] * windows.angle) * length
-        sizes = np.concatenate([np.full(n, _UNITS[0]), np.repeat(turned, 2), _UNITS[2] + windows.off])[:rows] * used
-        group = np.repeat([0, 1, 2], [n, 2 * n, n])[:rows]
+        sizes = windows.placed(np.full(n, _UNITS[0]), turned, _UNITS[2] + windows.off) * used
         level = np.where(group == 2, used, 0.0)
         roots = [np.where(group == k, sizes, 0.0) for k in range(3)]  # independent: the roots alone
         factors = roots if windows.alone else [BlockFactor(places, _UNITS[0] * values), *roots[1:]]
-        measured = shaken.component(rows) + self._common() ** 2 * np.outer(level, level) + np.diag(1e-9 * used)
+        measured = shaken.component(len(used)) + self._common() ** 2 * np.outer(level, level) + np.diag(1e-9 * used)
         if not windows.alone:
             bent = windows.bent(field) * windows.level[:, None]
             # what the hand and the accelerometer's errors do to its length, they do across it, where nothing shows it
@@ -475,6 +479,5 @@ class MagneticField(OfOneUnit):
 def _across(field: FloatArray) -> FloatArray:
     """Two unit vectors (n, 2, 3) across each vector and each other."""
     along = unit_vectors(field)
-    other = np.eye(3)[np.argmin(np.abs(along), axis=1)]
-    first = unit_vectors(np.cross(along, other))
+    first = unit_vectors(np.cross(along, np.eye(3)[abs(along).argmin(axis=1)]))
     return np.stack([first, np.cross(along, first)], axis=1)

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
-from jaximu.ground.rotation import conjugate, multiply, rotate, unit_vectors
+from jaximu.ground.rotation import Quaternion, Vector, conjugate, multiply, rotate, unit_vectors
 
 
-def level(attitude: Float[Array, "4"], force: Float[Array, "3"]) -> Float[Array, "4"]:
+def level(attitude: Quaternion, force: Vector) -> Quaternion:
     """Return the attitude turned the shortest way so that a specific force measured at rest points up."""
     x, y, z = rotate(attitude, unit_vectors(force))
     half_turn = jnp.array([0.0, 1.0, 0.0, 0.0])  # where it points straight down
@@ -28,5 +28,4 @@ def gravity_direction_error(
     rotations: Float[Array, "T 4"], directions: Float[Array, "P 3"], basis: Float[Array, "T 2 3"]
 ) -> Float[Array, "T 2"]:
     """Return the components across gravity (rad, for small errors) of u_{k+1} − R u_k."""
-    predicted = rotate(conjugate(rotations), directions[..., :-1, :])
-    return across(basis, directions[..., 1:, :] - predicted)
+    return across(basis, directions[..., 1:, :] - rotate(conjugate(rotations), directions[..., :-1, :]))

@@ -12,7 +12,9 @@ import numpy as np
 
 from jaximu.estimation.data import Handling
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.vectors import dot_rows, lengths_of, variances_of
+from jaximu.ground.distributions import rms
+from jaximu.ground.rotation import rotate
+from jaximu.ground.vectors import dot_rows, lengths_of, sigmas_of
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.finding import Finding
@@ -49,19 +51,16 @@ def handling(
     tilting[: len(tilts)], spread[: len(tilts)] = lengths_of(tilts), sigma
     excess = np.maximum(tilting**2 - 2 * np.where(np.isfinite(spread), spread, 0.0) ** 2, 0.0)
     off = excess / 2 * ((poses.stop - poses.start) / 2) ** 2
-    gyroscope = imu.triads()["gyroscope"]
+    gyroscope = imu.triad("gyroscope")
     assert noise.gyroscope is not None
-    scale = gyroscope.scales
-    rest = (excess / 2)[:, None] * scale**2
-    moving = np.concatenate([np.zeros(count), np.repeat(off[:-1] + off[1:], 2), rest.ravel()])
+    rest = np.outer(excess / 2, gyroscope.scales**2)
+    moving = np.concatenate([np.zeros(count), (off[:-1] + off[1:]).repeat(2), rest.ravel()])
 
     turned = missed_by_sampling(turns, gyroscope, np.asarray(running))
-    interval = turns.interval
-    white = float(np.mean(noise.gyroscope.split(_SHORT)[0]))
-    known = white * np.sum(interval, axis=1)
-    missed = np.sum(turned**2, axis=1) - 3 * known
+    known = float(noise.gyroscope.split(_SHORT)[0].mean()) * turns.interval.sum(axis=1)
+    missed = (turned**2).sum(axis=1) - 3 * known
     missed = np.where(turns.mask, np.maximum(missed, 0.0), 0.0)
-    sampling = np.concatenate([np.zeros(count), np.repeat(missed / 3, 2), np.zeros(3 * count)])
+    sampling = np.pad((missed / 3).repeat(2), (count, 3 * count))
     return Handling(moving, sampling, np.sqrt(excess), spread, np.sqrt(missed), np.sqrt(known))
 
 
@@ -74,17 +73,17 @@ def sway(segmentations: Sequence[Segmentation], imu: Imu, noise: NoiseModel) -> 
     turned = []
     for part in segmentations:
         gyroscope = part.recording.signals["gyroscope"]
-        rate = imu.triads()["gyroscope"].recover_on_host(gyroscope.values)
+        rate = imu.triad("gyroscope").recover_on_host(gyroscope.values)
         for start, stop in part.intervals:
             inside = (gyroscope.time >= start) & (gyroscope.time < stop)
-            weight = 1 - np.abs(2 * (gyroscope.time[inside] - start) / (stop - start) - 1)
+            weight = 1 - abs(2 * (gyroscope.time[inside] - start) / (stop - start) - 1)
             turned.append(weight @ rate[inside] / max(float(weight.sum()), 1e-12))
     tilts, sigma = _tilts(segmentations, imu, noise.accelerometer)
     rates = np.array(turned) - np.median(turned, axis=0)
     both = dot_rows(tilts, rates)
     along = both / np.maximum(lengths_of(rates), 1e-300) / sigma
-    along = np.clip(along, -_BOUND, _BOUND)  # one pose that was bumped is not all
-    if np.sum(along) < _SURE * np.sqrt(len(along)):
+    along = along.clip(-_BOUND, _BOUND)  # one pose that was bumped is not all
+    if along.sum() < _SURE * np.sqrt(len(along)):
         return []
     size = np.degrees(np.sqrt(max(1.5 * float(np.median(both)), 0.0)))
     return [
@@ -116,18 +115,16 @@ def moved_by_hand(
     findings = []
     poses = observations.poses
     start, stop = poses.start, poses.stop
-    variance = variances_of(poses.gyroscope_covariance)
-    scale = imu.triads()["gyroscope"].scales
-    noise = np.sqrt(np.mean(variance / scale**2, axis=1))
+    noise = rms(sigmas_of(poses.gyroscope_covariance) / imu.triad("gyroscope").scales, axis=1)
     moving = np.flatnonzero(poses.mask & (hands.tilting > _SURE * hands.noise) & (hands.tilting > noise))
     if len(moving):
-        worst = moving[np.argmax(hands.tilting[moving])]
+        worst = moving[hands.tilting[moving].argmax()]
         times = [part.recording.accelerometer.time for part in segmentations for _ in part.intervals]
         findings.append(
             Finding(
                 "data.moving_pose",
-                tuple(int(np.searchsorted(times[pose], start[pose])) + 1 for pose in moving[:5]),
-                f"{len(moving)} of {int(np.sum(poses.mask))} poses are not still: the one from {start[worst]:.1f} to "
+                tuple(int(times[pose].searchsorted(start[pose])) + 1 for pose in moving[:5]),
+                f"{len(moving)} of {int(poses.mask.sum())} poses are not still: the one from {start[worst]:.1f} to "
                 f"{stop[worst]:.1f} s tilts by {np.degrees(hands.tilting[worst]):.2g} °/s. They and the turns around "
                 "them count for less. Put the unit down, or hold it against something solid.",
             )
@@ -135,7 +132,7 @@ def moved_by_hand(
     real = observations.turns.mask
     expected, known = undersampling * hands.missed / np.sqrt(3), hands.turned
     coarse = real & (expected > 2 * known)
-    if undersampling < 1 and np.sum(coarse) > _MANY * np.sum(real):
+    if undersampling < 1 and coarse.sum() > _MANY * real.sum():
         rate = segmentations[0].recording.signals["gyroscope"].rate
         # what sampling misses falls with the rate's square
         needed = rate * np.sqrt(np.quantile(expected[coarse] / known[coarse], 0.9))
@@ -143,7 +140,7 @@ def moved_by_hand(
             Finding(
                 "data.sampling",
                 (),
-                f"{int(np.sum(coarse))} of {int(np.sum(real))} turns are too quick for a sample rate of {rate:.4g} Hz: "
+                f"{int(coarse.sum())} of {int(real.sum())} turns are too quick for a sample rate of {rate:.4g} Hz: "
                 f"computed from every other sample they differ by up to {np.degrees(2 * hands.missed.max()):.2g}°, and "
                 f"from all samples they are uncertain by about {np.degrees(np.median(expected[coarse])):.2g}° each. "
                 f"They count for less. Log at {_rounded(needed)} Hz or more, or turn more slowly and put the unit down "
@@ -174,11 +171,11 @@ def _tilts(segmentations: Sequence[Segmentation], imu: Imu, noise: AxisNoise) ->
                 continue
             before, after = (half.mean(axis=0) for half in halves)
             both = before + after
-            turned = np.cross(after - before, both) / np.sum(both * both) * 2
+            turned = np.cross(after - before, both) / (both * both).sum() * 2
             covariance = noise.covariance([start, middle], [middle, stop]).mean(axis=0)
             variance = covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]
             rates.append(turned / (middle - start))
-            spreads.append(float(np.sqrt(variance)) / (middle - start) / float(np.linalg.norm(both) / 2))
+            spreads.append(float(np.sqrt(variance)) / (middle - start) / float(lengths_of(both) / 2))
     return np.array(rates), np.array(spreads)
 
 
@@ -190,7 +187,4 @@ def missed_by_sampling(turns: Turns, gyroscope: Triad, running: FloatArray) -> F
     rates = gyroscope.recover_on_host(turns.output)
     interval = turns.interval
     sign = np.where(np.arange(interval.shape[1]) % 2 == 0, 1.0, -1.0)
-    axis = running[..., 1:]
-    across = 2 * np.cross(axis, rates)
-    turned = rates + running[..., :1] * across + np.cross(axis, across)
-    return dot_rows(turned, (interval * sign)[..., None])
+    return dot_rows(np.asarray(rotate(running, rates)), (interval * sign)[..., None])

@@ -121,6 +121,11 @@ class MotionIntervals(eqx.Module):
     real: Numbers
     sightings: tuple[Sighting, ...] = ()
 
+    @property
+    def before(self) -> int:
+        """Samples that precede each interval."""
+        return self.time.shape[-1] - self.length.shape[-1]
+
 
 class Disturbances(eqx.Module):
     """What disturbs a unit and its path, in SI; vectors (6,) are of rate, then force.
@@ -154,6 +159,10 @@ class MotionPath(eqx.Module):
     attitude: Quaternion
     velocity: Vector
 
+    def moved(self, change: Float[Array, "... 6"]) -> MotionPath:
+        """Return the path with its ends turned in the body frame by a rotation vector, and sped up (m/s)."""
+        return MotionPath(turned(self.attitude, change[..., :3]), self.velocity + change[..., 3:])
+
 
 def merged_drift(noise: NoiseModel, shortest: float, most: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return white densities (6,), variances (k, 6) and correlation times (k,) of a noise model, k ≤ `most`.
@@ -162,19 +171,18 @@ def merged_drift(noise: NoiseModel, shortest: float, most: int) -> tuple[FloatAr
     one with the sum of their variances and the mean of their times: near zero frequency the density stays what it was.
     """
     white, parts = [], []
-    for axes, triad in zip(np.split(np.arange(6), 2), (noise.gyroscope, noise.accelerometer), strict=True):
+    for before, triad in ((0, noise.gyroscope), (3, noise.accelerometer)):
         assert triad is not None
         density, slow = triad.split(shortest)
         white.append(density)
-        for time, variance in zip(slow.correlation_time, slow.variance.T, strict=True):
-            parts.append((float(time), np.zeros(6)))
-            parts[-1][1][axes] = variance
+        variances = (np.pad(variance, (before, 3 - before)) for variance in slow.variance.T)
+        parts += zip(slow.correlation_time.tolist(), variances, strict=True)
     parts = sorted((part for part in parts if part[1].any()), key=lambda part: part[0])
     unit = np.repeat(np.mean(white, axis=1), 3)
     while len(parts) > most:
         times, variances = zip(*parts, strict=True)
-        k = int(np.argmin(np.divide(times[1:], times[:-1])))
-        weights = [np.sum(variance / unit) for variance in variances[k : k + 2]]
+        k = int(np.divide(times[1:], times[:-1]).argmin())
+        weights = [(variance / unit).sum() for variance in variances[k : k + 2]]
         parts[k : k + 2] = [(float(np.average(times[k : k + 2], weights=weights)), variances[k] + variances[k + 1])]
     times = np.array([time for time, _ in parts])
     variance = np.array([variance for _, variance in parts]).reshape(-1, 6)
@@ -187,7 +195,7 @@ def merged_drift(noise: NoiseModel, shortest: float, most: int) -> tuple[FloatAr
 def _carried(attitude, velocity, rotation, gained, duration, earth, gravity):
     """Return attitude and velocity after an interval of motion."""
     pushed = rotate(attitude, gained)
-    pushed = pushed - jnp.cross(earth, pushed) * duration / 2
+    pushed -= jnp.cross(earth, pushed) * duration / 2
     fallen = 2 * jnp.cross(earth, velocity) + UP * gravity
     return (
         multiply(exponential(-earth * duration), multiply(attitude, rotation)),
@@ -203,14 +211,13 @@ def _samples(like: Imu, numbers: Array, part: MotionIntervals):
     imu = ravel_pytree(like)[1](numbers)
     bare = imu.without(GyroEarthRotation, *MOUNTING_EFFECTS)
     force, rate = bare.recover(part.accelerometer, part.gyroscope, Stimulus(time=part.time))
-    felt = jnp.concatenate([rate, force], axis=-1)
+    felt = jnp.hstack([rate, force])
     true = felt
     for _ in range(_UNDONE if bare.setup else 0):
         path = Stimulus(true[:, 3:], true[:, :3], time=part.time)
         made = [getattr(bare.acted(path, name), name) for name in ("angular_rate", "specific_force")]
-        true = felt - jnp.concatenate(made, axis=-1) + true
-    inside = true[part.time.shape[-1] - part.length.shape[-1] :]
-    return inside, imu.coefficients(GyroEarthRotation), jnp.hstack(Mounting.of(imu))
+        true = felt - jnp.hstack(made) + true
+    return true[part.before :], imu.coefficients(GyroEarthRotation), jnp.hstack(Mounting.of(imu))
 
 
 class _Means(eqx.Module):
@@ -243,10 +250,10 @@ def _condensed(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -
 
 def _of_motion(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -> _Means:
     samples, earth, mounting = _samples(like, numbers, part)
-    whole = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
+    whole = preintegrate_samples(*jnp.hsplit(samples, 2), intervals=part.length)
     reaction = whole.reaction[:, :6]
     length = jnp.asarray(part.length)
-    last = jnp.maximum(jnp.sum(length > 0) - 1, 0)
+    last = jnp.maximum((length > 0).sum() - 1, 0)
     before = jnp.maximum(last - 1, 0)
     apart = (length[last] + length[before]) / 2
 
@@ -255,9 +262,9 @@ def _of_motion(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -
 
     def moved(numbers):  # exactly: a change of rates and forces also changes coning and sculling
         samples, earth, mounting = _samples(like, numbers, part)
-        varied = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
-        turned = logarithm(multiply(conjugate(whole.rotation), varied.rotation))
-        return jnp.concatenate([turned, varied.velocity]), earth, ended(samples), mounting
+        varied = preintegrate_samples(*jnp.hsplit(samples, 2), intervals=part.length)
+        off = logarithm(multiply(conjugate(whole.rotation), varied.rotation))
+        return jnp.concatenate([off, varied.velocity]), earth, ended(samples), mounting
 
     increments, by_earth, by_ending, by_mounting = jax.jacfwd(moved)(numbers)
     return _Means(
@@ -280,7 +287,7 @@ def _of_motion(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -
 
 
 def _of_rest(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -> _Means:
-    before = part.time.shape[-1] - part.length.shape[-1]
+    before = part.before
     few = 2 * before + 1
     share = part.length / _duration(part)
     # effects see the mean output, as they do of poses, and nothing that changes: noise is no motion
@@ -294,9 +301,9 @@ def _of_rest(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -> 
         return samples[0], *beside
 
     (mean, earth, mounting), (means, by_earth, by_mounting) = value_and_jacobian(of, numbers)
-    identity, none = jnp.zeros(4).at[0].set(1.0), jnp.zeros((6, 6))
+    none = jnp.zeros((6, 6))
     return _Means(
-        identity,
+        jnp.asarray(IDENTITY),
         jnp.zeros(3),
         none,
         none,
@@ -305,8 +312,8 @@ def _of_rest(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -> 
         means,
         earth,
         by_earth,
-        jnp.concatenate([mean, jnp.zeros(3)]),
-        jnp.concatenate([means, jnp.zeros_like(means[:3])]),
+        jnp.pad(mean, (0, 3)),
+        jnp.pad(means, ((0, 3), (0, 0))),
         jnp.asarray(part.length)[0] / 2,
         mounting,
         by_mounting,
@@ -336,28 +343,28 @@ def _rows(
 
     def off(change, attitude, velocity):
         """Return by how much attitude (rad) and velocity (m/s) miss the end of the path, moved by a change (6,)."""
-        end = multiply(after.attitude, exponential(change[:3]))
-        return jnp.concatenate([logarithm(multiply(conjugate(end), attitude)), velocity - after.velocity - change[3:]])
+        end = after.moved(change)
+        return jnp.concatenate([logarithm(multiply(conjugate(end.attitude), attitude)), velocity - end.velocity])
 
     def both(change):
-        start, end, increment = change[:6], change[6:12], change[12:18]
-        begin = multiply(before.attitude, exponential(start[:3]))
+        end, increment = change[6:12], change[12:18]
+        begin = before.moved(change[:6])
         moved = _carried(
-            begin,
-            before.velocity + start[3:],
+            begin.attitude,
+            begin.velocity,
             multiply(means.rotation, exponential(increment[:3])),
             means.gained + increment[3:],
             means.duration,
             means.earth + change[18:21],
             gravity + change[21],
         )
-        return jnp.where(moving > 0, off(end, *moved), off(end, begin, jnp.zeros(3)))
+        return jnp.where(moving > 0, off(end, *moved), off(end, begin.attitude, jnp.zeros(3)))
 
     value, slopes = value_and_jacobian(both, jnp.zeros(22))
     push = slopes[:, 12:18]
     lost = (errors.lost * part.lost) ** 2
     swept = push @ (means.by_noise + jnp.diag(lost)) @ push.T + jnp.diag(jnp.asarray(_FLOOR) ** 2)
-    stays = jnp.repeat(jnp.array([errors.creep * means.duration + _FLOOR[0] ** 2, _STILL**2]), 3)
+    stays = jnp.array([errors.creep * means.duration + _FLOOR[0] ** 2, _STILL**2]).repeat(3)
     weights = inverse_cholesky(jnp.where(moving > 0, swept, jnp.diag(stays)))
     by_number = push @ means.increments + slopes[:, 18:21] @ means.by_earth
     by_drift = jnp.tile(-push @ means.by_drift, (1, errors.variance.shape[0]))
@@ -365,23 +372,24 @@ def _rows(
     known = jnp.array(_first_root(1.0)).at[2].set(1 / jnp.where(shown, _RESTARTED, _HEADING))
 
     def restarted(change):
-        end = multiply(after.attitude, exponential(change[:3]))
-        turned = rotate(anchor, logarithm(multiply(conjugate(anchor), end)))  # in the level frame: heading is its z
-        return known * jnp.concatenate([turned, after.velocity + change[3:]])
+        end = after.moved(change)
+        off = rotate(anchor, logarithm(multiply(conjugate(anchor), end.attitude)))  # in the level frame: heading is z
+        return known * jnp.concatenate([off, end.velocity])
 
     miss, by_end = value_and_jacobian(restarted, jnp.zeros(6))
-    none = jnp.zeros((6, drifts))
+    beside = (0, 0), (0, drifts)
     carrying = WhiteRows(
-        weights @ jnp.concatenate([slopes[:, :6], by_drift], axis=1),
-        weights @ jnp.concatenate([slopes[:, 6:12], none], axis=1),
-        weights @ jnp.concatenate([by_number, slopes[:, 21:]], axis=1),
+        weights @ jnp.hstack([slopes[:, :6], by_drift]),
+        weights @ jnp.pad(slopes[:, 6:12], beside),
+        weights @ jnp.hstack([by_number, slopes[:, 21:]]),
         -weights @ value,
     )
-    beginning = carrying._replace(before=0.0, after=jnp.concatenate([by_end, none], axis=1), shared=0.0, right=-miss)
+    beginning = carrying._replace(before=0.0, after=jnp.pad(by_end, beside), shared=0.0, right=-miss)
     process = jax.tree.map(partial(jnp.where, (part.restart > 0) & (part.real > 0)), beginning, carrying)
     wander = _wandering(jnp.where(part.real > 0, means.duration, 1.0), errors, by_number.shape[1] + 1)
-    rows = [process, wander, _measured(means, part, errors, gravity, after, size)]
-    rows += [_sighted(means, part, sighting, errors, gravity, after, size) for sighting in part.sightings]
+    about = errors, gravity, after, size
+    rows = [process, wander, _measured(means, part, *about)]
+    rows += [_sighted(means, part, sighting, *about) for sighting in part.sightings]
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), *rows)
 
 
@@ -390,9 +398,9 @@ def _wandering(duration: Array, errors: Disturbances, numbers: int) -> WhiteRows
     drifts = errors.variance.size
     kept = jnp.exp(-duration / errors.correlation_time)
     variance = errors.variance * -jnp.expm1(-2 * duration / errors.correlation_time)[:, None]
-    white = 1 / jnp.sqrt(variance).reshape(-1)
+    white = 1 / jnp.sqrt(variance).ravel()
     return WhiteRows(
-        jnp.pad(jnp.diag(-white * jnp.repeat(kept, 6)), ((0, 0), (6, 0))),
+        jnp.pad(jnp.diag(-white * kept.repeat(6)), ((0, 0), (6, 0))),
         jnp.pad(jnp.diag(white), ((0, 0), (6, 0))),
         jnp.zeros((drifts, numbers)),
         jnp.zeros(drifts),
@@ -405,23 +413,22 @@ def _measured(
     """Return 6 rows measured at the end: rate and force of a rest, the velocity where motion ends, or nothing."""
 
     def still(change):  # attitude, earth, gravity
-        back = conjugate(multiply(after.attitude, exponential(change[:3])))
+        back = conjugate(turned(after.attitude, change[:3]))
         up = rotate(back, UP)
         return means.mean - jnp.concatenate([rotate(back, means.earth + change[3:6]), up * (gravity + change[6])])
 
     value, slopes = value_and_jacobian(still, jnp.zeros(7))
     copies = errors.variance.shape[0]
-    by_state = jnp.concatenate([slopes[:, :3], jnp.zeros((6, 3)), jnp.tile(-jnp.eye(6), (1, copies))], axis=1)
-    by_number = jnp.concatenate([means.means + slopes[:, 3:6] @ means.by_earth, slopes[:, 6:]], axis=1)
+    by_state = jnp.hstack([slopes[:, :3], jnp.zeros((6, 3)), jnp.tile(-jnp.eye(6), (1, copies))])
+    by_number = jnp.hstack([means.means + slopes[:, 3:6] @ means.by_earth, slopes[:, 6:]])
     weight = part.rest * part.real * jnp.sqrt(means.duration / errors.rest)
     stopping = part.arrival * part.real / errors.arrival
     stop = jnp.zeros((6, size)).at[:3, 3:6].set(jnp.eye(3))
-    velocity = jnp.concatenate([after.velocity, jnp.zeros(3)])
     return WhiteRows(
         jnp.zeros((6, size)),
         weight[:, None] * by_state + stopping * stop,
         weight[:, None] * by_number,
-        -weight * value - stopping * velocity,
+        -weight * value - stopping * jnp.pad(after.velocity, (0, 3)),
     )
 
 
@@ -439,10 +446,11 @@ def _sighted(
 
     def off(change):  # attitude and velocity, the end, gravity, the mounting
         moved, ended, gravitated, remounted = jnp.split(change, parts)
+        end = after.moved(moved)
         rate, force, acceleration = jnp.split(means.ending + ended, 3)
         standing = Standing(
-            multiply(after.attitude, exponential(moved[:3])),
-            after.velocity + moved[3:],
+            end.attitude,
+            end.velocity,
             rate,
             force,
             acceleration,
@@ -455,7 +463,7 @@ def _sighted(
     weight = sighting.measured * part.real / getattr(errors, sighting.noise)
     by_path, by_ending, by_gravity, by_mounting = jnp.split(slopes, parts, axis=1)
     by_state = jnp.pad(by_path, ((0, 0), (0, size - 6)))
-    by_number = jnp.concatenate([by_ending @ means.by_ending + by_mounting @ means.by_mounting, by_gravity], axis=1)
+    by_number = jnp.hstack([by_ending @ means.by_ending + by_mounting @ means.by_mounting, by_gravity])
     return WhiteRows(jnp.zeros_like(by_state), weight * by_state, weight * by_number, -weight * value)
 
 
@@ -483,7 +491,7 @@ def carried(
 ) -> MotionPath:
     """Return the path's end after an interval, as a unit's numbers have it: the same attitude in a rest or restart."""
     samples, earth, _ = _samples(like, numbers, part)
-    whole = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
+    whole = preintegrate_samples(*jnp.hsplit(samples, 2), intervals=part.length)
     attitude, velocity = _carried(
         before.attitude, before.velocity, whole.rotation, whole.velocity, whole.duration, earth, gravity
     )
@@ -494,10 +502,9 @@ def carried(
 def first_field(intervals: MotionIntervals, imu: Imu) -> FloatArray:
     """Return the magnetic field (3,) in the level frame, µT, as the first rest in which it is measured has it."""
     (sighting,) = (sighting for sighting in intervals.sightings if isinstance(sighting, FieldSeen))
-    at = int(np.argmax(sighting.measured > 0))
+    at = int((sighting.measured > 0).argmax())
     part = part_of(intervals, at)
-    before = part.time.shape[-1] - part.length.shape[-1]
-    mean = part.length @ part.accelerometer[before:] / part.length.sum()
+    mean = part.length @ part.accelerometer[part.before :] / part.length.sum()
     attitude = level(IDENTITY, imu.with_effects().accelerometer.recover(mean))
     for other in part.sightings:
         if other.absolute and other.measured > 0:
@@ -514,7 +521,7 @@ def _first_root(heading: float) -> FloatArray:
     return np.array([1 / _LEVEL, 1 / _LEVEL, 1 / heading, *(3 * [1 / _STILL])])
 
 
-def first_knowledge(errors: Disturbances, velocity: Float[Array, 3], shared: int, turned: bool = False) -> Knowledge:
+def first_knowledge(errors: Disturbances, velocity: Vector, shared: int, turned: bool = False) -> Knowledge:
     """Return what is known of the first state, in a rest, about a path with that velocity; of shared numbers nothing.
 
     Tilt is as good as unknown; heading, which rests and motion do not determine, is held where the path has it, unless
@@ -522,8 +529,7 @@ def first_knowledge(errors: Disturbances, velocity: Float[Array, 3], shared: int
     """
     drift = 1 / np.sqrt(np.ravel(errors.variance))
     root = np.concatenate([_first_root(_LEVEL if turned else _HEADING), drift, np.zeros(shared)])
-    right = np.zeros(len(root))
-    right[3:6] = -np.asarray(velocity) / _STILL
+    right = np.pad(-np.asarray(velocity) / _STILL, (3, len(root) - 6))
     return Knowledge(np.diag(root), right)
 
 
@@ -540,73 +546,49 @@ def longest_rest(errors: Disturbances) -> float:
     return float(np.sqrt(np.min(squared, initial=np.inf)))
 
 
-@dataclass(frozen=True)
-class _Pieces:
-    """Intervals of a recording: samples from `begin` to before `end` (N,), and which are rests or restarts (N,).
+def _pieces(
+    recording: Recording, lost: FloatArray, rests: IntArray, marks: FloatArray, still: float
+) -> tuple[list[tuple[int, int, bool, bool]], list[str]]:
+    """Return the intervals between and in rests, first and last sample (P, 2), and notes on what was left out.
 
-    skipped: s of motion left out as too long; jumped: motions left out over missing samples; bridged: s without
-    samples in the others.
+    Of each interval: its samples, from one to before another, and whether it is a rest or a restart.
     """
-
-    begin: IntArray
-    end: IntArray
-    rest: BoolArray
-    restart: BoolArray
-    skipped: float
-    jumped: int
-    bridged: float
-
-    @classmethod
-    def of(
-        cls,
-        gyroscope: Signal,
-        edges: FloatArray,
-        lost: FloatArray,
-        rests: IntArray,
-        marks: FloatArray,
-        still: float,
-    ) -> _Pieces:
-        """Return the intervals between and in rests, first and last sample (P, 2)."""
-        time, unseen = gyroscope.time, lost * lengths_of(gyroscope.si())
-        pieces, skipped, jumped, bridged = [], 0.0, 0, lost[rests[0, 0] : rests[-1, 1]].sum()
-        moved_from = None
-        for start, stop in rests.tolist():
-            if moved_from is not None:
-                far = unseen[moved_from:start].sum() > FARTHEST_UNSEEN
-                long = _unseen(marks, float(time[moved_from]), float(time[start])) > LONGEST_MOTION
-                if far or long:  # nothing of the attitude is left
-                    pieces.append((moved_from, moved_from + 1, False, True))
-                    skipped += long * float(time[start] - time[moved_from])
-                    jumped += far and not long
-                    bridged -= lost[moved_from:start].sum()
-                else:
-                    parts = _on_marks(_parts(time, moved_from, start, _LONGEST), edges, marks)
-                    pieces += [(*part, False, False) for part in parts]
-            longest = max(_LONGEST, min(still, float(time[stop] - time[start]) / _PARTS))
-            pieces += [(*part, True, False) for part in _parts(time, start, stop, longest)]
-            moved_from = stop
-        begin, end, rest, restart = map(np.array, zip(*pieces, strict=True))
-        return cls(begin, end, rest, restart, skipped, int(jumped), bridged)
-
-    def notes(self, name: str) -> list[str]:
-        """Say what of a recording was left out."""
-        notes = []
-        if self.skipped:
-            notes.append(
-                f"{name}: {self.skipped:.0f} s of motion without a rest for more than {LONGEST_MOTION:.0f} s were left "
-                "out: attitude cannot be carried so far."
-            )
-        if self.jumped:
-            notes.append(
-                f"{name}: {self.jumped} motion{'s' if self.jumped > 1 else ''} in which samples are missing while the "
-                "unit turned were left out: nobody knows how far it turned."
-            )
-        if self.bridged > 1e-9:
-            notes.append(
-                f"{name}: {self.bridged:.3g} s without samples were bridged by holding the neighbouring samples; "
-                "the uncertainty of attitude and velocity grows there."
-            )
-        return notes
+    gyroscope, name = recording.signals["gyroscope"], recording.name
+    time, unseen = gyroscope.time, lost * lengths_of(gyroscope.si())
+    pieces, skipped, jumped, bridged = [], 0.0, 0, lost[rests[0, 0] : rests[-1, 1]].sum()
+    moved_from = None
+    for start, stop in rests.tolist():
+        if moved_from is not None:
+            far = unseen[moved_from:start].sum() > FARTHEST_UNSEEN
+            long = _unseen(marks, float(time[moved_from]), float(time[start])) > LONGEST_MOTION
+            if far or long:  # nothing of the attitude is left
+                pieces.append((moved_from, moved_from + 1, False, True))
+                skipped += long * float(time[start] - time[moved_from])
+                jumped += far and not long
+                bridged -= lost[moved_from:start].sum()
+            else:
+                parts = _on_marks(_parts(time, moved_from, start, _LONGEST), gyroscope.edges, marks)
+                pieces += [(*part, False, False) for part in parts]
+        longest = max(_LONGEST, min(still, float(time[stop] - time[start]) / _PARTS))
+        pieces += [(*part, True, False) for part in _parts(time, start, stop, longest)]
+        moved_from = stop
+    notes = []
+    if skipped:
+        notes.append(
+            f"{name}: {skipped:.0f} s of motion without a rest for more than {LONGEST_MOTION:.0f} s were left out: "
+            "attitude cannot be carried so far."
+        )
+    if jumped:
+        notes.append(
+            f"{name}: {jumped} motion{'s' if jumped > 1 else ''} in which samples are missing while the unit turned "
+            "were left out: nobody knows how far it turned."
+        )
+    if bridged > 1e-9:
+        notes.append(
+            f"{name}: {bridged:.3g} s without samples were bridged by holding the neighbouring samples; the "
+            "uncertainty of attitude and velocity grows there."
+        )
+    return pieces, notes
 
 
 def cut(
@@ -631,17 +613,16 @@ def cut(
     force, edges = accelerometer.at(time), gyroscope.edges
     step = np.diff(time, prepend=time[0] - period, append=time[-1] + period)
     lost = midpoints(np.where(step > 2.5 * period, step - period, 0.0))
-    resting = np.searchsorted(time, rests + np.array([_SETTLING, -_SETTLING]))
+    resting = time.searchsorted(rests + np.array([_SETTLING, -_SETTLING]))
     marks = np.zeros(0) if attitude is None else np.asarray((mounting or Mounting()).on_log(attitude.time))
-    pieces = _Pieces.of(gyroscope, edges, lost, resting, marks, still)
-    begin, end, rest, restart = pieces.begin, pieces.end, pieces.rest, pieces.restart
-    notes = pieces.notes(recording.name)
+    pieces, notes = _pieces(recording, lost, resting, marks, still)
+    begin, end, rest, restart = map(np.array, zip(*pieces, strict=True))
     if (ahead := rests[0, 0] - time[0]) > 1.0:
         notes.append(f"{recording.name}: the first {ahead:.1f} s, before the first rest, were left out.")
     samples, count = padded_size(int((end - begin).max()) + beyond), len(begin)
     inside = begin[:, None] + np.arange(samples) < end[:, None]
     around = begin[:, None] + np.arange(-beyond, samples)
-    around = np.clip(around, 0, np.minimum(end + beyond, len(time))[:, None] - 1)
+    around = around.clip(0, np.minimum(end + beyond, len(time))[:, None] - 1)
     rest_follows = np.append(rest[1:], False)
     arrival = ~rest & ~restart & rest_follows
     sightings, ends = [], _padded(edges[end])
@@ -651,7 +632,7 @@ def cut(
         value[final], known[final] = _mean_field(field, time[resting[:, 0]], time[resting[:, 1] - 1])
         sightings.append(FieldSeen(ends, ends, _padded(known), _padded(value)))
     if attitude is not None:  # in a rest any stamp will do; in motion one in the last sample
-        latest = np.searchsorted(marks, edges[end], side="right") - 1
+        latest = marks.searchsorted(edges[end], side="right") - 1
         since = np.where(rest, edges[begin], edges[end - 1])
         measured = (latest >= 0) & (marks[latest] > since) & ~arrival & ~restart
         at = _padded(attitude.time[latest]), ends, _padded(measured)
@@ -682,7 +663,7 @@ def _padded(values, mode: Any = "constant") -> FloatArray:
 
 def _mean_field(field: Signal, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return the mean (P, 3) of a field between times (P,), and whether there are samples (P,)."""
-    first, last = np.searchsorted(field.time, (start, stop))
+    first, last = field.time.searchsorted((start, stop))
     means = [field.values[a:b].mean(axis=0) if b > a else np.zeros(3) for a, b in zip(first, last, strict=True)]
     return np.array(means), last > first
 
@@ -692,14 +673,12 @@ def _parts(time: FloatArray, start: int, stop: int, longest: float) -> list[tupl
     if stop <= start:
         return []
     count = max(1, int(np.ceil((stop - start) * np.median(np.diff(time)) / longest - 1e-9)))
-    edges = np.linspace(start, stop, min(count, stop - start) + 1).round().astype(int)
-    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+    return list(pairwise(np.linspace(start, stop, min(count, stop - start) + 1).round().astype(int).tolist()))
 
 
 def _unseen(marks: FloatArray, start: float, stop: float) -> float:
     """Return how long (s) nothing says how the unit stands, between two times and a reference's stamps."""
-    inside = marks[(marks > start) & (marks < stop)]
-    return float(np.diff(np.concatenate([[start], inside, [stop]])).max())
+    return float(np.diff(marks[(marks > start) & (marks < stop)], prepend=start, append=stop).max())
 
 
 def _on_marks(parts: list[tuple[int, int]], edges: FloatArray, marks: FloatArray) -> list[tuple[int, int]]:
@@ -707,11 +686,11 @@ def _on_marks(parts: list[tuple[int, int]], edges: FloatArray, marks: FloatArray
     if not len(marks) or len(parts) < 2:
         return parts
     ends = np.array([end for _, end in parts[:-1]])
-    later = np.clip(np.searchsorted(marks, edges[ends]), 1, len(marks) - 1)
+    later = marks.searchsorted(edges[ends]).clip(1, len(marks) - 1)
     near = np.where(edges[ends] - marks[later - 1] < marks[later] - edges[ends], later - 1, later)
-    moved = np.searchsorted(edges, marks[near])
-    ends = np.where(np.abs(marks[near] - edges[ends]) < _LONGEST / 4, moved, ends)
-    ends = np.unique(np.clip(ends, parts[0][0] + 1, parts[-1][1] - 1))
+    moved = edges.searchsorted(marks[near])
+    ends = np.where(abs(marks[near] - edges[ends]) < _LONGEST / 4, moved, ends)
+    ends = np.unique(ends.clip(parts[0][0] + 1, parts[-1][1] - 1))
     return list(pairwise([parts[0][0], *ends.tolist(), parts[-1][1]]))
 
 
@@ -785,8 +764,7 @@ class IntervalsOfMotion(OfOneUnit):
         """
         intervals = self.intervals
         sighted = [3 * (sighting.measured > 0) for sighting in intervals.sightings]
-        inner = 6 * intervals.rest + 3 * intervals.arrival
-        return np.stack([inner, *sighted], axis=1).astype(float)
+        return np.column_stack([6 * intervals.rest + 3 * intervals.arrival, *sighted]).astype(float)
 
     def filtered(self, imu: Imu) -> Filtered:
         """Return the intervals filtered about one unit, along the path that fits it best."""
@@ -802,7 +780,7 @@ class IntervalsOfMotion(OfOneUnit):
             last, eliminated, innovations, _ = run(start, rows)
             state = scipy.linalg.solve_triangular(last.root[:states, :states], last.right[:states])
             earlier = smooth(eliminated, state, np.zeros(shared))
-            moved = np.concatenate([earlier, state[None]])[:, :6]
+            moved = np.vstack([earlier, state])[:, :6]
             if not np.isfinite(moved).all():
                 raise NotPossibleError(
                     "attitude and velocity could not be followed through this recording: the start is too far off. "
@@ -810,7 +788,7 @@ class IntervalsOfMotion(OfOneUnit):
                 )
             if _change(self.path, moved, absolute) < _UNMOVED or number + 1 == _ROUNDS:
                 break
-            self.path = stored.call(_moved, "moved path", self.path, moved)
+            self.path = stored.call(MotionPath.moved, "moved path", self.path, moved)
         return Filtered(last, self.path, float(innovations.sum()), rows)
 
     @property
@@ -839,7 +817,7 @@ class IntervalsOfMotion(OfOneUnit):
     def _part(self, rows: IntArray) -> MotionIntervals:
         """Return some of the intervals, without the samples that none of them has."""
         part = part_of(self.intervals, rows)
-        before = part.time.shape[1] - part.length.shape[1]
+        before = part.before
         inside = min(padded_size(int((part.length > 0).sum(axis=1).max()) + before), part.length.shape[1])
         samples = {name: getattr(part, name)[:, : before + inside] for name in ("accelerometer", "gyroscope", "time")}
         return replace(part, length=part.length[:, :inside], **samples)
@@ -907,7 +885,7 @@ def _dead_reckoned(means: _Means, intervals: MotionIntervals, gravity: Array) ->
 
     start = level(IDENTITY, means.mean[0, 3:])
     for sightings in intervals.sightings:  # the heading at the first sighting is the heading of all
-        k = jnp.argmax(sightings.measured > 0)
+        k = (sightings.measured > 0).argmax()
         sighting, numbers = part_of((sightings, means.mounting), k)
         now = reckoned(start, False)[k]
         placed = sighting.placed(now, Mounting.from_numbers(numbers))
@@ -933,12 +911,7 @@ def _change(path: MotionPath, moved: FloatArray, absolute: bool) -> float:
     """Return how far attitudes move, rad, but for the heading of all unless it is measured: it is held, and creeps."""
     turned = np.array(rotate(path.attitude, moved[:, :3]))
     turned[:, 2] -= 0.0 if absolute else turned[0, 2]
-    return float(np.max(np.abs(turned)))
-
-
-def _moved(path: MotionPath, moved: Array) -> MotionPath:
-    """Return a path whose ends turn and speed up by moved (N + 1, 6)."""
-    return MotionPath(turned(path.attitude, moved[:, :3]), path.velocity + moved[:, 3:])
+    return float(abs(turned).max())
 
 
 def turned(attitude: Quaternion, vector: Vector) -> Quaternion:

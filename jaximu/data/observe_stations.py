@@ -13,7 +13,6 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
 
@@ -22,7 +21,7 @@ from jaximu.ground import stored
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.precision import require_float64
-from jaximu.ground.rotation import unit_vectors
+from jaximu.ground.rotation import UP, rotations_of, unit_vectors
 from jaximu.ground.vectors import variances_of
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
@@ -80,7 +79,6 @@ def observe_stations(
     references: Sequence[ScheduleEntry] | Sequence[Sequence[ScheduleEntry]],
     gravity: float,
     noise: NoiseModel | None = None,
-    temperature_reference: float = REFERENCE_TEMPERATURE,
 ) -> tuple[Stations, tuple[str, ...]]:
     """Distil recordings of one unit at known poses and turns into padded `Stations`, and notes for the user.
 
@@ -102,12 +100,13 @@ def observe_stations(
         matched, remarks = match_reference(recording, entries)  # pyright: ignore[reportArgumentType]
         parts.append((recording, matched))
         notes += remarks
+    first = parts[0][0]
     known = all(None not in attitudes(entries) for recording, entries in parts if recording.attitude is None)
     stimuli, means, covariances, spans, turns = [], [], [], [], []
     for recording, entries in parts:
         span = times_of(entries)
         turn = np.array([entry.kind == "turn" for entry in entries])
-        stimulus = _recorded_stimulus(recording, entries, span, gravity, temperature_reference)
+        stimulus = _recorded_stimulus(recording, entries, span, gravity)
         stimuli.append(stimulus if known else replace(stimulus, attitude=None))
         signals = [signal for signal in (recording.accelerometer, recording.gyroscope) if signal is not None]
         means.append([_means(signal, span) for signal in signals])
@@ -115,7 +114,7 @@ def observe_stations(
             covariances.append([_mean_covariance(signal, span, turn, recording.name) for signal in signals])
         spans.append(span)
         turns.append(turn)
-    owner = np.repeat(np.arange(len(parts)), [len(span) for span in spans])
+    owner = np.arange(len(parts)).repeat([len(span) for span in spans])
     together = owner[:, None] == owner
     span, turn = np.concatenate(spans), np.concatenate(turns)
     stacked = [np.concatenate(of_triad) for of_triad in zip(*means, strict=False)]
@@ -126,14 +125,14 @@ def observe_stations(
         ]
     else:
         measured = [
-            _known_covariance(getattr(parts[0][0], name), getattr(noise, name), name, span, together)
+            _known_covariance(getattr(first, name), getattr(noise, name), name, span, together)
             for name in TRIADS[: len(stacked)]
         ]
-    if len(stacked) > 1 and parts[0][0].gyroscope is not None:  # a later power-on has another bias
+    if len(stacked) > 1 and first.gyroscope is not None:  # a later power-on has another bias
         later = together & (owner > 0)
-        measured[1] += later * np.square(POWER_ON["gyroscope"] * parts[0][0].gyroscope.nominal_scale)[:, None, None]
+        measured[1] += later * ((POWER_ON["gyroscope"] * first.gyroscope.nominal_scale) ** 2)[:, None, None]
     stimulus = jax.tree.map(lambda *leaves: np.concatenate(leaves), *stimuli)
-    force = ~turn & (len(parts[0][0].accelerometer) > 0)
+    force = ~turn & (len(first.accelerometer) > 0)
     return assembled(stacked, measured, stimulus, span, turn, gravity, force, owner), tuple(dict.fromkeys(notes))
 
 
@@ -170,18 +169,15 @@ def _known_covariance(
 
 
 def _recorded_stimulus(
-    recording: Recording,
-    entries: Sequence[ScheduleEntry],
-    span: FloatArray,
-    gravity: float,
-    temperature_reference: float,
+    recording: Recording, entries: Sequence[ScheduleEntry], span: FloatArray, gravity: float
 ) -> Stimulus:
-    nodes = span[:, :1] + np.diff(span) * np.linspace(0.0, 1.0, 2 * NODES + 1)
+    course = np.linspace(0.0, 1.0, 2 * NODES + 1)
+    nodes = span[:, :1] + np.diff(span) * course
     time = nodes[:, 1::2]
     if recording.attitude is not None:
         stimulus = _along(recording.attitude, nodes, gravity)
     else:
-        course = np.tile(np.linspace(0.0, 1.0, 2 * NODES + 1), (len(entries), 1))
+        course = np.tile(course, (len(entries), 1))
         if recording.gyroscope is not None:
             integral = Integral(recording.gyroscope)
             bias = rest_rate(integral, entries)
@@ -190,7 +186,7 @@ def _recorded_stimulus(
                     moved = integral.over(span[k, :1], nodes[k]) - bias * (nodes[k] - span[k, 0])[:, None]
                     course[k] = moved @ entry.vector / (moved[-1] @ entry.vector)
         stimulus = _stimulus(entries, attitudes(entries), course, gravity)
-    temperature = np.full(time.shape, temperature_reference)
+    temperature = np.full(time.shape, REFERENCE_TEMPERATURE)
     if recording.temperature is not None:
         temperature = recording.temperature.at(time)[..., 0]
     return replace(stimulus, time=time, temperature=temperature)
@@ -199,18 +195,19 @@ def _recorded_stimulus(
 def _along(attitude: Signal, nodes: FloatArray, gravity: float) -> Stimulus:
     """Force, rate and attitude (S, Q) where the reference tells the attitude at all times."""
     quaternion = unit_vectors(attitude.values)
-    clipped = np.clip(nodes, attitude.time[0], attitude.time[-1])
-
-    def rotation(array):
-        return scipy.spatial.transform.Rotation.from_quat(array.reshape(-1, 4), scalar_first=True)
-
-    rotations = scipy.spatial.transform.Slerp(attitude.time, rotation(quaternion))(clipped.ravel())
+    clipped = nodes.clip(attitude.time[0], attitude.time[-1])
+    rotations = scipy.spatial.transform.Slerp(attitude.time, rotations_of(quaternion))(clipped.ravel())
     whole = rotations.as_quat(scalar_first=True).reshape(*clipped.shape, 4)
     edges, middle = whole[:, ::2], whole[:, 1::2]
+    step = (rotations_of(edges[:, :-1]).inv() * rotations_of(edges[:, 1:])).as_rotvec().reshape(*middle.shape[:2], 3)
+    return Stimulus(
+        specific_force=gravity * _up(middle), angular_rate=step / np.diff(nodes[:, ::2])[..., None], attitude=middle
+    )
 
-    step = (rotation(edges[:, :-1]).inv() * rotation(edges[:, 1:])).as_rotvec().reshape(*middle.shape[:2], 3)
-    up = rotation(middle).inv().apply([0.0, 0.0, 1.0]).reshape(*middle.shape[:2], 3)
-    return Stimulus(specific_force=gravity * up, angular_rate=step / np.diff(nodes[:, ::2])[..., None], attitude=middle)
+
+def _up(attitude: FloatArray) -> FloatArray:
+    """Return what points up (S, Q, 3) in the body frame, at attitudes (S, Q, 4)."""
+    return rotations_of(attitude).inv().apply(UP).reshape(*attitude.shape[:2], 3)
 
 
 def scheme_stations(
@@ -234,14 +231,13 @@ def scheme_stations(
     plan = protocol.plan(np.random.default_rng(0), replace(environment or Environment(), latitude=None))
     entries, motion = plan.intervals, plan.motion
     span = times_of(entries)
-    segment = np.searchsorted(motion.start, span[:, 0] + 1e-9, side="right") - 1
-    begin = [
-        scipy.spatial.transform.Rotation.from_quat(attitude, scalar_first=True) for attitude in motion.attitude[segment]
-    ]
+    segment = motion.start.searchsorted(span[:, 0] + 1e-9, side="right") - 1
+    begin = list(map(rotations_of, motion.attitude[segment]))
     nodes = np.linspace(0.0, 1.0, 2 * NODES + 1)  # edges and, between them, middles
     course = np.asarray(jax.jit(smooth_course)(nodes, motion.ramp[segment][:, None]))
     time = span[:, :1] + np.diff(span) * nodes[1::2]
-    stimulus = _stimulus(entries, begin, course, float(motion.gravity))
+    gravity = float(motion.gravity)
+    stimulus = _stimulus(entries, begin, course, gravity)
     stimulus = replace(stimulus, time=time, temperature=np.interp(time, motion.temperature_time, motion.temperature))
     turn = np.array([entry.kind == "turn" for entry in entries])
     scale = [triad.scales for triad in imu.triads().values()]
@@ -253,8 +249,7 @@ def scheme_stations(
         for axes, gain in zip(known, scale, strict=True)
         if axes is not None
     ]
-    zero = np.zeros((len(entries), 3))
-    means, gravity = [zero, zero][: len(scale)], float(motion.gravity)
+    means = [np.zeros((len(entries), 3))] * len(scale)
     stations = assembled(means, covariances, stimulus, span, turn, gravity, ~turn)
     means = stored.call(_mean_outputs, "station means", imu, stations)
     means += [np.zeros_like(stations.gyroscope_mean)] * (2 - len(means))
@@ -263,7 +258,7 @@ def scheme_stations(
 
 def _mean_outputs(imu: Imu, stations: Stations):
     outputs = imu.respond(stations.stimulus)
-    return [jnp.sum(stations.weight[..., None] * output, axis=-2) for output in outputs if output is not None]
+    return [(stations.weight[..., None] * output).sum(axis=-2) for output in outputs if output is not None]
 
 
 def _stimulus(
@@ -285,8 +280,7 @@ def _stimulus(
         for start, middle, turn in zip(whole, course[:, 1::2], turned, strict=True)
     )
     attitude = np.stack([middle.as_quat(scalar_first=True) for middle in middles])
-    back = rotation.from_quat(attitude.reshape(-1, 4), scalar_first=True).inv()
-    up = back.apply([0.0, 0.0, 1.0]).reshape(*attitude.shape[:2], 3)
+    up = _up(attitude)
     pose = np.array([entry.kind == "pose" for entry in entries])
     up[pose] = vector[pose][:, None]  # as stated, to the last digit
     known = all(start is not None for start in begin)
@@ -319,7 +313,7 @@ def assembled(
     used = [np.pad(force, missing), there if len(means) > 1 else np.zeros(size, bool)]
 
     def pad(array: FloatArray) -> FloatArray:
-        return np.concatenate([array, np.repeat(array[:1], size - count, axis=0)])
+        return np.concatenate([array, array[:1].repeat(size - count, axis=0)])
 
     def spread(matrix: FloatArray, used: BoolArray) -> FloatArray:
         whole = np.zeros((3, size, size))

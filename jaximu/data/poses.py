@@ -99,7 +99,7 @@ class HandHeldConditions(Conditions):
 
     def rotations(self, imu: Imu) -> Float[Array, "T 4"]:
         """Return the turns' rotations, quaternions from the last body frame to the first, at a unit close by."""
-        moved = jnp.einsum("tijk,jk->ti", self.slope, imu.triads()["gyroscope"].inverse() - self.linear)
+        moved = jnp.einsum("tijk,jk->ti", self.slope, imu.triad("gyroscope").inverse() - self.linear)
         return multiply(self.rotation, exponential(moved))
 
     def forces(self, imu: Imu) -> Float[Array, "P 3"]:
@@ -112,9 +112,8 @@ class HandHeldConditions(Conditions):
         force = self.forces(imu)
         norm = jnp.where(self.pose, gravity_norm_error(force, self.magnitude), 0.0)
         direction = gravity_direction_error(self.rotations(imu), unit_vectors(force), self.basis)
-        rest = jnp.where(self.pose[:, None], self.gyroscope_mean - imu.triads()["gyroscope"].bias, 0.0)
-        turned = jnp.where(self.turn[:, None], direction, 0.0)
-        return jnp.concatenate([norm, turned.reshape(-1), rest.reshape(-1)])
+        rest = jnp.where(self.pose[:, None], self.gyroscope_mean - imu.triad("gyroscope").bias, 0.0)
+        return jnp.concatenate([norm, jnp.where(self.turn[:, None], direction, 0.0).ravel(), rest.ravel()])
 
 
 def condense(
@@ -122,7 +121,7 @@ def condense(
 ) -> tuple[HandHeldConditions, Covariance | Chain, Turned, Sensitivities]:
     """Return the conditions about a unit, without its effects, their covariance, and what both were made of."""
     imu, poses, turns = imu.with_effects(), observations.poses, observations.turns
-    gyroscope = imu.triads()["gyroscope"]
+    gyroscope = imu.triad("gyroscope")
     whole = turned_by(gyroscope, turns)
     rotation = whole.rotation
     if method != "exponential":
@@ -323,11 +322,11 @@ class PosesAndTurns(Observations, Data):
             outputs = added(imu.with_effects(effect), tracks)
             means = mean_outputs(tracks, outputs, reaction.norm.shape[0])
             force = means[:, :3]
-            norm = jnp.sum(reaction.norm * force, axis=-1)
+            norm = (reaction.norm * force).sum(axis=-1)
             turn = jnp.einsum("tai,ti->ta", reaction.after, force[1:])
-            turn = turn + jnp.einsum("tai,ti->ta", reaction.before, force[:-1])
-            turn = turn + jnp.einsum("tasi,tsi->ta", reaction.turn, during_turns(outputs["gyroscope"], samples))
-            return jnp.concatenate([norm, turn.reshape(-1), means[:, 3:].reshape(-1)])
+            turn += jnp.einsum("tai,ti->ta", reaction.before, force[:-1])
+            turn += jnp.einsum("tasi,tsi->ta", reaction.turn, during_turns(outputs["gyroscope"], samples))
+            return jnp.concatenate([norm, turn.ravel(), means[:, 3:].ravel()])
 
         parts = zip(details.tracks, self.samples, strict=True)
         return "by hand", of, [(tracks, part.sample, details.reaction) for tracks, part in parts]
@@ -419,11 +418,11 @@ def resized(leaf: Array, *lengths: int, numerics: Any = np) -> Array:
 def pose_rows(imu: Imu, observations: Observations) -> Rows:
     """Return what each of the conditions of poses and turns is, by a unit close to this one."""
     poses, turns = on_host((observations.poses, observations.turns))
-    gyroscope = imu.triads()["gyroscope"]
+    gyroscope = imu.triad("gyroscope")
     pose, turn = np.arange(len(poses.mask)), np.arange(len(turns.mask))
 
     def placed(of_poses, of_turns):
-        return np.concatenate([of_poses, np.repeat(of_turns, 2, axis=0), np.repeat(of_poses, 3, axis=0)])
+        return np.concatenate([of_poses, of_turns.repeat(2, axis=0), of_poses.repeat(3, axis=0)])
 
     unknown = np.full(len(pose), np.nan), np.full(len(turn), np.nan)
     speed = np.degrees(lengths_of(gyroscope.recover_on_host(turns.output))) * (turns.interval > 0)
@@ -444,7 +443,7 @@ def pose_rows(imu: Imu, observations: Observations) -> Rows:
         to_si=np.concatenate([np.ones(len(pose) + 2 * len(turn)), np.tile(1 / gyroscope.scales, len(pose))]),
         used=placed(poses.mask, turns.mask).astype(bool),
         covariates=covariates,
-        spans=np.stack([poses.start, poses.stop], axis=1),
+        spans=np.column_stack([poses.start, poses.stop]),
     )
 
 
@@ -465,8 +464,8 @@ def _errors(conditions: HandHeldConditions, imu: Imu) -> tuple[Array, Array]:
     force = conditions.forces(imu)
     directions = unit_vectors(force)
     predicted = rotate(conjugate(conditions.rotation), directions[:-1])
-    chord = jnp.sqrt(jnp.sum((predicted - directions[1:]) ** 2, axis=-1))
-    return force, jnp.where(conditions.turn, 2 * jnp.arcsin(jnp.clip(chord / 2, 0, 1)), 0.0)
+    chord = jnp.sqrt(((predicted - directions[1:]) ** 2).sum(axis=-1))
+    return force, jnp.where(conditions.turn, 2 * jnp.arcsin((chord / 2).clip(0, 1)), 0.0)
 
 
 def residual_rms(
@@ -481,8 +480,7 @@ def residual_rms(
     """
     poses, turns = np.asarray(observations.poses.mask), np.asarray(observations.turns.mask)
     force, angle = forces_and_angles(imu, observations) if known is None else known
-    norm = lengths_of(force[poses]) - float(observations.gravity)
-    sizes = {"gravity_norm": (rms(norm), "m/s^2")}
+    sizes = {"gravity_norm": (rms(lengths_of(force[poses]) - float(observations.gravity)), "m/s^2")}
     if imu.gyroscope is None or not gyroscope:
         return sizes
     if turns.any():

@@ -41,7 +41,7 @@ def turn_noise(gyroscope: Triad, turns: Turns, whole: Turned) -> Float[Array, "T
     """Return the covariance (rad²) of the turns' last frames by the gyroscope's white noise."""
     inverse = inverse_matrix(gyroscope.gain)
     swept = white_covariance(whole.sweep, inverse @ turns.noise @ inverse.T, turns.interval)
-    return whole.back @ swept @ whole.back.swapaxes(-1, -2)
+    return whole.back @ swept @ whole.back.mT
 
 
 def _pose_sensitivities(imu: Imu, observations: Observations, rotations: Float[Array, "T 4"]):
@@ -53,7 +53,7 @@ def _pose_sensitivities(imu: Imu, observations: Observations, rotations: Float[A
     inverse = imu.accelerometer.inverse()
     force = poses.accelerometer_mean @ inverse[:, :3].T + inverse[:, 3]
     unit, jacobian = unit_vectors(force), inverse[:, :3]
-    length = jnp.sqrt(jnp.sum(force**2, axis=-1))[:, None, None]
+    length = jnp.sqrt((force**2).sum(axis=-1))[:, None, None]
     direction = (jacobian - unit[:, :, None] * (unit @ jacobian)[:, None]) / length
     back = rotation_matrix(conjugate(rotations))
     norm = -(force @ jacobian) / observations.gravity
@@ -68,7 +68,7 @@ def _pose_sensitivities(imu: Imu, observations: Observations, rotations: Float[A
 def sensitivities(imu: Imu, observations: Observations, whole: Turned) -> Sensitivities:
     """Return the derivatives of the conditions by mean accelerometer outputs and by gyroscope samples."""
     norm, after, before, lever = _pose_sensitivities(imu, observations, whole.rotation)
-    inverse = inverse_matrix(imu.triads()["gyroscope"].gain)
+    inverse = inverse_matrix(imu.triad("gyroscope").gain)
     return Sensitivities(norm, after, before, (lever[:, None] @ whole.reaction @ inverse).swapaxes(1, 2))
 
 
@@ -80,26 +80,26 @@ def condition_covariance(imu: Imu, observations: Observations, whole: Turned | N
     `whole`: the turns' rotations at this model, where at hand.
     """
     poses, turns, slow = observations.poses, observations.turns, observations.slow
-    gyroscope = imu.triads()["gyroscope"]
+    gyroscope = imu.triad("gyroscope")
     whole = turned_by(gyroscope, turns) if whole is None else whole
     norm, after, before, lever = _pose_sensitivities(imu, observations, whole.rotation)
     spread = turn_noise(gyroscope, turns, whole)
     real, moved = poses.mask[:, None, None], turns.mask[:, None, None]
     none = jnp.zeros((1, 2, 3))
     # what a pose reaches: its norm and the turn after it, of which the last has none, and the turn before it
-    reached = jnp.concatenate([real * norm[:, None], jnp.concatenate([moved * before, none])], axis=1)
+    reached = jnp.hstack([real * norm[:, None], jnp.concatenate([moved * before, none])])
     earlier = jnp.pad(jnp.concatenate([none, moved * after]), ((0, 0), (1, 0), (0, 0)))
     by_turn = jnp.pad(jnp.concatenate([moved * lever, none]), ((0, 0), (1, 0), (0, 0)))
     force, rest = (real * noisy for noisy in (poses.accelerometer_covariance, poses.gyroscope_covariance))
     roots = mean_root(force, poses.mask), mean_root(spread, turns.mask), mean_root(rest, poses.mask)
-    used = jnp.concatenate([poses.mask, jnp.repeat(turns.mask, 2), jnp.repeat(poses.mask, 3)]).astype(norm.dtype)
+    used = jnp.concatenate([poses.mask, turns.mask.repeat(2), poses.mask.repeat(3)]).astype(norm.dtype)
     counts = len(norm), 2 * len(lever), 3 * len(norm)
-    group = jnp.repeat(jnp.arange(3), jnp.array(counts), total_repeat_length=sum(counts))
+    group = jnp.arange(3).repeat(jnp.array(counts), total_repeat_length=sum(counts))
     white = 1.0 if slow is None else 0.0  # slow noise has that of the means in it
     chain = Chain(
-        white * (reached @ force @ reached.swapaxes(1, 2) + following(earlier @ force @ earlier.swapaxes(1, 2)))
-        + by_turn @ jnp.concatenate([spread, jnp.zeros((1, 3, 3))]) @ by_turn.swapaxes(1, 2),
-        white * reached @ force @ earlier.swapaxes(1, 2),
+        white * (reached @ force @ reached.mT + following(earlier @ force @ earlier.mT))
+        + by_turn @ jnp.concatenate([spread, jnp.zeros((1, 3, 3))]) @ by_turn.mT,
+        white * reached @ force @ earlier.mT,
         white * rest,
         reached @ roots[0],
         earlier @ roots[0],

@@ -96,7 +96,7 @@ def turned_by_rates(rates: Vectors, intervals: Float[Array, "... S"]) -> Turned:
 def linear_slope(reaction: Float[Array, "... S k 3"], output: Vectors) -> Float[Array, "... k 3 4"]:
     """Return how sums react to (A | c), of samples A y + c, by their reaction to each sample and its output y."""
     with_one = jnp.concatenate([output, jnp.ones_like(output[..., :1])], axis=-1)
-    sums = _flat(reaction).swapaxes(-1, -2) @ with_one
+    sums = _flat(reaction).mT @ with_one
     return sums.reshape(*sums.shape[:-2], *reaction.shape[-2:], 4)
 
 
@@ -110,7 +110,7 @@ def white_covariance(
 ) -> Float[Array, "... k k"]:
     """Return the covariance of sums whose samples have white noise of a density (two-sided, unit² s)."""
     entries, shape = _flat(reaction), reaction.shape[-2:]
-    squares = (entries / jnp.where(intervals > 0, intervals, 1.0)[..., None]).swapaxes(-1, -2) @ entries
+    squares = (entries / jnp.where(intervals > 0, intervals, 1.0)[..., None]).mT @ entries
     return jnp.einsum("...ijkl,jl->...ik", squares.reshape(*squares.shape[:-2], *shape, *shape), density)
 
 
@@ -145,17 +145,17 @@ class Preintegrated(NamedTuple):
 def preintegrate_samples(rates: Vectors, forces: Vectors, intervals: Float[Array, "... S"]) -> Preintegrated:
     """Return the increments of rates (rad/s) and specific forces (m/s²) that hold over `intervals` (s)."""
     vectors, gained = increments(rates, forces, intervals)
-    left_jacobian = jnp.swapaxes(right_jacobian(vectors), -1, -2)
+    left_jacobian = right_jacobian(vectors).mT
     whole = turned_by_rates(rates, intervals)
     start = jnp.zeros_like(whole.running[..., :1, :]).at[..., 0].set(1.0)
     before = rotation_matrix(jnp.concatenate([start, whole.running[..., :-1, :]], axis=-2))
-    left = (jnp.cumsum(intervals[..., ::-1], axis=-1)[..., ::-1] - intervals / 2)[..., None]
+    left = (intervals[..., ::-1].cumsum(axis=-1)[..., ::-1] - intervals / 2)[..., None]
     by_force = before @ left_jacobian * intervals[..., None, None]
     parts = apply_matrix(before @ left_jacobian, gained)
     bent = apply_matrix(before, jnp.cross(vectors, gained)) * intervals[..., None] / 12
     rows = [jnp.concatenate([whole.reaction, jnp.zeros_like(whole.sweep)], axis=-1)]
     for moved, weight in ((parts, jnp.ones_like(left)), (parts * left, left)):
-        later = jnp.cumsum(moved[..., ::-1, :], axis=-2)[..., ::-1, :] - moved / 2  # half of its own sample's, too
+        later = moved[..., ::-1, :].cumsum(axis=-2)[..., ::-1, :] - moved / 2  # half of its own sample's, too
         swung = -jnp.cross(later[..., :, None], whole.sweep, axis=-2)
         rows.append(jnp.concatenate([swung, by_force * weight[..., None]], axis=-1))
     return Preintegrated(
@@ -169,8 +169,8 @@ def preintegrate_samples(rates: Vectors, forces: Vectors, intervals: Float[Array
 
 def preintegrate(
     imu: Imu,
-    accelerometer: Float[Array, "S 3"],
-    gyroscope: Float[Array, "S 3"],
+    accelerometer: Vectors,
+    gyroscope: Vectors,
     intervals: Float[Array, " S"],
     stimulus: Stimulus | None = None,
 ) -> Preintegrated:
@@ -189,8 +189,8 @@ def preintegrate(
 
     def recovered(numbers):
         force, rate = restore(numbers).recover(accelerometer, gyroscope, stimulus)
-        return jnp.concatenate([rate, force], axis=-1)
+        return jnp.hstack([rate, force])
 
     samples, slopes = value_and_jacobian(recovered, numbers)
-    whole = preintegrate_samples(samples[:, :3], samples[:, 3:], intervals)
+    whole = preintegrate_samples(*jnp.hsplit(samples, 2), intervals=intervals)
     return whole._replace(parameters=jnp.einsum("sij,sjm->im", whole.reaction, slopes))

@@ -96,7 +96,7 @@ class RecordedStations(OfOneUnit):
         count = len(self.stations.turn)
 
         def of(effect, imu, tracks):
-            return mean_outputs(tracks, added(imu.with_effects(effect), tracks), count).reshape(-1)
+            return mean_outputs(tracks, added(imu.with_effects(effect), tracks), count).ravel()
 
         return f"stations {count}", of, details.tracks
 
@@ -126,7 +126,7 @@ class RecordedStations(OfOneUnit):
     def counts(self) -> dict[str, int]:
         """Return the numbers of poses and turns that are used."""
         turn, used = np.asarray(self.stations.turn), _used(self.stations)
-        return {"poses": int(np.sum(used & ~turn)), "turns": int(np.sum(used & turn))}
+        return {"poses": int((used & ~turn).sum()), "turns": int((used & turn).sum())}
 
     def rate_at_rest(self) -> FloatArray | None:
         """Return the gyroscope's mean output (3,) over the poses in which it is used, where there are some."""
@@ -226,22 +226,21 @@ def _used(stations: Stations) -> BoolArray:
 
 
 def _spans(stations: Stations, chosen: BoolArray) -> FloatArray:
-    return np.stack([stations.start[chosen], stations.stop[chosen]], axis=1)
+    return np.column_stack([stations.start[chosen], stations.stop[chosen]])
 
 
 def _in_order(stations: Stations) -> IntArray:
     """Return the places of the stations that are used, in the order of time."""
     real = np.flatnonzero(_used(stations))
-    return real[np.argsort(stations.start[real])]
+    return real[stations.start[real].argsort()]
 
 
 def station_of(time: FloatArray, stations: Stations) -> IntArray:
     """Return the station (n,) that each stamp lies in, S where in none."""
     order = _in_order(stations)
     start, stop = stations.start[order], stations.stop[order]
-    latest = np.maximum(np.searchsorted(start, time, side="right") - 1, 0)
-    inside = (time >= start[latest]) & (time < stop[latest])
-    return np.where(inside, order[latest], len(stations.turn))
+    latest = np.maximum(start.searchsorted(time, side="right") - 1, 0)
+    return np.where((time >= start[latest]) & (time < stop[latest]), order[latest], len(stations.turn))
 
 
 def _path(recording: Recording, stations: Stations, imu: Imu) -> dict[str, Track]:
@@ -253,7 +252,7 @@ def _path(recording: Recording, stations: Stations, imu: Imu) -> dict[str, Track
         signal = recording.signals[name]
         station = station_of(signal.time, stations)
         inside = station < count
-        nearest = np.clip(np.searchsorted(midpoints(nodes.time), signal.time), 0, len(nodes.time) - 1)
+        nearest = midpoints(nodes.time).searchsorted(signal.time).clip(0, len(nodes.time) - 1)
         motion = {field: np.array(getattr(known, field)) for field in ("specific_force", "angular_rate")}
         for field, values in motion.items():
             values[inside] = interpolated(nodes.time, getattr(nodes, field), signal.time[inside])

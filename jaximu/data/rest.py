@@ -40,7 +40,7 @@ class _WhiteOutputs(Conditions):
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the combinations, axis after axis."""
-        bias = jnp.where(self.gyroscope == 1, imu.triads()["gyroscope"].bias, imu.accelerometer.bias)
+        bias = jnp.where(self.gyroscope == 1, imu.triad("gyroscope").bias, imu.accelerometer.bias)
         return self.output - self.bias @ bias
 
 
@@ -60,12 +60,12 @@ class RestOverTemperature(OfOneUnit):
         self.weights = weights
         if apart.shape[1]:  # combinations that no level moves
             whole = np.linalg.qr(weights @ apart, mode="complete")[0]
-            self.weights = whole[:, :, apart.shape[1] :].swapaxes(1, 2) @ weights
+            self.weights = whole[:, :, apart.shape[1] :].mT @ weights
         self._length = padded_count(self.weights.shape[1])  # of an axis
         used = np.zeros((3, self._length))
         used[:, : self.weights.shape[1]] = 1.0
         factors = tuple((used * axis[:, None]).ravel() for axis in np.eye(3))
-        group = np.repeat(np.arange(3), self._length)
+        group = np.arange(3).repeat(self._length)
         self.covariance = Covariance(np.ones(3 * self._length), factors, used.ravel(), group)
         self.bias = self._white(np.tile(np.eye(3), (len(output), 1, 1)))
 
@@ -73,8 +73,7 @@ class RestOverTemperature(OfOneUnit):
         """Return the outputs without what the effects of the unit add to them."""
         added, slopes = mean_terms(tuple(imu.all_effects().values()), self.paths, len(self.output))
         output = self._white((self.output - added)[:, :, None])[:, 0]
-        gyroscope = np.int64(self.triad == "gyroscope")
-        conditions = _WhiteOutputs(output, self.bias, np.float64(0.0), gyroscope)
+        conditions = _WhiteOutputs(output, self.bias, np.float64(0.0), np.int64(self.triad == "gyroscope"))
         return About(conditions, self.covariance, self._white(-slopes))
 
     def _white(self, values: FloatArray) -> FloatArray:
@@ -93,7 +92,7 @@ def mean_terms(effects: Sequence[Effect], tracks: Sequence[Track], count: int) -
     for effect in effects:
         numbers = np.concatenate([effect.coefficients, [float(getattr(effect, name)) for name in effect.inner]])
         value, slope = over_blocks(effect.plain, numbers[None], tracks, count, slopes=True)
-        added = added + value[0]
+        added += value[0]
         slopes.append(slope[0])
     return added, free_columns(dict(enumerate(effects)), np.concatenate(slopes, axis=2))
 

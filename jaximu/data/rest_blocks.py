@@ -17,7 +17,7 @@ from jaximu.ground.differences import midpoints
 from jaximu.ground.distributions import rms, robust_sigma
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import sentence
-from jaximu.ground.vectors import column_lengths, lengths_of
+from jaximu.ground.vectors import column_lengths, lengths_of, means_by_group
 from jaximu.mistakes import Prepared, prepared
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.processes import RATIO, correlation_times
@@ -77,8 +77,7 @@ class Leg:
 
     def __str__(self) -> str:
         low, high = sorted(self.rates, key=abs)
-        steady = abs(high) < _STEADY * abs(low)
-        rates = [self.rate] if steady else [high, low]
+        rates = [self.rate] if abs(high) < _STEADY * abs(low) else [high, low]
         text = f"{self.begin:.0f} → {self.end:.0f} °C at {' to '.join(f'{60 * rate:+.2g}' for rate in rates)} K/min"
         return text.replace("-", "−")
 
@@ -118,9 +117,19 @@ class RestBlocks:
         return int(self.level.max(initial=-1)) + 1
 
     @property
+    def of_level(self) -> FloatArray:
+        """Ones (n, levels) where a block has a bias."""
+        return np.eye(self.levels)[self.level]
+
+    @property
+    def by_recording(self) -> list[IntArray]:
+        """The blocks of each recording."""
+        return [np.flatnonzero(self.log == log) for log in range(len(self.recordings))]
+
+    @property
     def several_poses(self) -> bool:
         """Whether the unit lay in more than one pose: a rest of its own may also begin with a jump of the bias."""
-        return bool(np.max(np.ptp(self.by_rest(self.means["accelerometer"]), axis=0)) > _OTHER_POSE)
+        return bool(np.ptp(self.by_rest(self.means["accelerometer"]), axis=0).max() > _OTHER_POSE)
 
     @property
     def range(self) -> tuple[float, float]:
@@ -130,10 +139,9 @@ class RestBlocks:
     @property
     def time(self) -> FloatArray:
         """Middle of each block, s, recordings one after another."""
-        gap, shift, middle = 0.02 * float(np.sum(self.stop - self.start)), 0.0, np.zeros(len(self))
-        for log in range(len(self.recordings)):
-            here = self.log == log
-            if here.any():
+        gap, shift, middle = 0.02 * float((self.stop - self.start).sum()), 0.0, np.zeros(len(self))
+        for here in self.by_recording:
+            if len(here):
                 middle[here] = shift + (self.start[here] + self.stop[here]) / 2
                 shift = middle[here].max() + gap
         return middle
@@ -141,8 +149,7 @@ class RestBlocks:
     def covariance(self, noise: AxisNoise) -> FloatArray:
         """Return the covariance (3, n, n), SI², of the means; recordings are independent."""
         whole = np.zeros((3, len(self), len(self)))
-        for log in range(len(self.recordings)):
-            here = np.flatnonzero(self.log == log)
+        for here in self.by_recording:
             whole[:, here[:, None], here] = noise.covariance(self.start[here], self.stop[here])
         return whole
 
@@ -155,8 +162,7 @@ class RestBlocks:
 
         About the mean of each rest, whose gravity nothing tells; of a gyroscope about that of each recording.
         """
-        group = self.rest if name == "accelerometer" else self.log
-        return rms(values - _about(group, values), axis=0)
+        return rms(values - _about(self.rest if name == "accelerometer" else self.log, values), axis=0)
 
     @property
     def spans(self) -> list[float]:
@@ -172,7 +178,7 @@ class RestBlocks:
         for track in self.nodes:
             block = np.asarray(track.observation)
             inside = block < count
-            nearest = np.maximum.accumulate(np.where(inside, np.arange(len(block)), np.argmax(inside)))
+            nearest = np.maximum.accumulate(np.where(inside, np.arange(len(block)), inside.argmax()))
             here, still = force[np.minimum(block[nearest], count - 1)], np.zeros((len(block), 3))
             stimulus = replace(
                 track.stimulus,
@@ -188,16 +194,15 @@ class RestBlocks:
         """Return the stretches in which the temperature goes one way; half of a soak belongs to each side."""
         legs = []
         least = _TURNING * (self.range[1] - self.range[0])
-        for log in range(len(self.recordings)):
-            here = np.flatnonzero(self.log == log)
+        for here in self.by_recording:
             edges = [0, *_turning_points(self.temperature[here], least), len(here)]
             for a, b in pairwise(edges):
                 part = here[a:b]
                 celsius = self.temperature[part]
                 rate = np.sort(self.rate[part])
-                moving = np.abs(rate) >= 0.5 * np.max(np.abs(rate))
-                gone = np.cumsum(np.abs(rate)) / np.sum(np.abs(rate))
-                low, high = (float(rate[min(np.searchsorted(gone, share), len(rate) - 1)]) for share in (0.1, 0.9))
+                moving = abs(rate) >= 0.5 * abs(rate).max()
+                gone = abs(rate).cumsum() / abs(rate).sum()
+                low, high = (float(rate[min(gone.searchsorted(share), len(rate) - 1)]) for share in (0.1, 0.9))
                 legs.append(
                     Leg(part, float(celsius[0]), float(celsius[-1]), float(np.median(rate[moving])), (low, high))
                 )
@@ -265,7 +270,7 @@ def _turning_points(celsius: FloatArray, least: float) -> list[int]:
 
 
 def _plateau(celsius: FloatArray, extreme: int, first: int, last: int, least: float) -> int:
-    near = np.flatnonzero(np.abs(celsius[first : last + 1] - celsius[extreme]) < 0.3 * least) + first
+    near = np.flatnonzero(abs(celsius[first : last + 1] - celsius[extreme]) < 0.3 * least) + first
     return int((near[0] + near[-1]) // 2)
 
 
@@ -300,8 +305,7 @@ def _of_ready(ready: Sequence[Prepared], block: float | None) -> RestBlocks:
         raise InputError(f"a block of {block:g} s holds less than two samples at {rate:g} Hz: state a longer one.")
     lost = [one.left_out.get("temperature", np.zeros(0)) for one in ready]
     blocks = joined([_cut(recording, block, stamps) for recording, stamps in zip(used, lost, strict=True)])
-    count = len(blocks)
-    if count > 3 * _MOST_BLOCKS:
+    if (count := len(blocks)) > 3 * _MOST_BLOCKS:
         raise InputError(
             f"blocks of {block:g} s are {count}, more than {3 * _MOST_BLOCKS}, whose noise cannot be "
             f"handled together: state a block of {span / _MOST_BLOCKS:.2g} s or more."
@@ -342,7 +346,7 @@ def joined(parts: Sequence[RestBlocks]) -> RestBlocks:
         return np.concatenate([getattr(part, name) + start for part, start in zip(parts, starts, strict=True)])
 
     total = sum(map(len, parts))
-    blocks = np.split(np.arange(total), np.cumsum([len(part) for part in parts])[:-1])
+    blocks = np.split(np.arange(total), np.cumsum(list(map(len, parts)))[:-1])
     return RestBlocks(
         tuple(recording for part in parts for recording in part.recordings),
         whole("start"),
@@ -379,17 +383,14 @@ def _cut(recording: Recording, block: float, lost: FloatArray) -> RestBlocks:
     count = nodes // _NODES
     good, moved, means = np.ones(count, bool), np.zeros(count, bool), {}
     for name in TRIADS:
-        signal = recording.signals.get(name)
-        if signal is None:
+        if (signal := recording.signals.get(name)) is None:
             continue
         at = np.floor((signal.time - begin) / block).astype(int)
         inside = (at >= 0) & (at < count)
         at, values = at[inside], signal.si()[inside]
-        number = np.bincount(at, minlength=count)
-        good &= number >= max(2, 0.5 * block * signal.rate)
-        safe = np.maximum(number, 1)
-        mean = np.stack([np.bincount(at, column, count) / safe for column in values.T], axis=1)
-        scatter = sum(np.bincount(at, column, count) for column in ((values - mean[at]) ** 2).T) / safe
+        good &= np.bincount(at, minlength=count) >= max(2, 0.5 * block * signal.rate)
+        mean = means_by_group(at, values, count)
+        scatter = means_by_group(at, (values - mean[at]) ** 2, count).sum(axis=1)
         moved |= scatter > _MOVING * (np.median(scatter[good]) if good.any() else 0.0)
         means[name] = mean
     parts = begin + block * np.arange(count + 1)
@@ -407,7 +408,7 @@ def _cut(recording: Recording, block: float, lost: FloatArray) -> RestBlocks:
     kept = np.full(count + 1, len(keep))
     kept[keep] = np.arange(len(keep))
     start, ambient = np.asarray(begin + block * keep, np.float64), recording.ambient_temperature
-    rest = np.cumsum(np.concatenate([[0], jumps]), dtype=np.int64)[: len(keep)]
+    rest = np.concatenate([[0], jumps]).cumsum(dtype=np.int64)[: len(keep)]
     block_of_node = kept[np.minimum(np.arange(nodes) // _NODES, count)]
     return RestBlocks(
         (recording,),
@@ -422,7 +423,7 @@ def _cut(recording: Recording, block: float, lost: FloatArray) -> RestBlocks:
         (Track(Stimulus(temperature=celsius, temperature_rate=slope, time=time), block_of_node),),
         None if ambient is None else by_block(_cells(ambient, edges)),
         float(block),
-        int(np.sum(good & moved)),
+        int((good & moved).sum()),
         (),
     )
 
@@ -431,10 +432,10 @@ def _cells(signal: Signal, edges: NDArray[np.floating]) -> FloatArray:
     """Return means between edges of the line through a signal's samples, which goes on as it ends."""
     time, values = signal.time, signal.values[:, 0]
     whole = np.cumulative_sum(np.diff(time) * midpoints(values), include_initial=True)
-    inside = np.clip(edges, time[0], time[-1])
-    k = np.clip(np.searchsorted(time, inside, side="right") - 1, 0, len(time) - 2)
+    inside = edges.clip(time[0], time[-1])
+    k = (time.searchsorted(inside, side="right") - 1).clip(0, len(time) - 2)
     integral = whole[k] + (inside - time[k]) * (values[k] + np.interp(inside, time, values)) / 2
-    integral = integral + (edges - inside) * np.where(edges < inside, values[0], values[-1])
+    integral += (edges - inside) * np.where(edges < inside, values[0], values[-1])
     return np.diff(integral) / np.diff(edges)
 
 
@@ -480,8 +481,7 @@ def without_startup(recording: Recording) -> Recording:
     usual miss.
     """
     signals = [recording.accelerometer, recording.gyroscope, recording.temperature]
-    first = max(_startup(signal) for signal in signals if signal is not None)
-    if not first:
+    if not (first := max(_startup(signal) for signal in signals if signal is not None)):
         return recording
     stamp = recording.accelerometer.time[first]
     changed = {
@@ -501,11 +501,10 @@ def _startup(signal: Signal) -> int:
     values = signal.values[: count + ahead]
     x = np.arange(1, ahead + 1.0)
     # the value at 0 of the least-squares line through x = 1 … ahead
-    weights = 1 / ahead - (x - x.mean()) * x.mean() / np.sum((x - x.mean()) ** 2)
+    weights = 1 / ahead - (x - x.mean()) * x.mean() / ((x - x.mean()) ** 2).sum()
     windows = np.lib.stride_tricks.sliding_window_view(values[1:], ahead, axis=0)  # (count, axes, ahead)
-    miss = np.abs(values[:count] - windows[:count] @ weights)
-    usual = robust_sigma(miss, axis=0)
-    bad = np.flatnonzero((miss > _STARTUP * np.maximum(usual, 1e-12)).any(axis=1))
+    miss = abs(values[:count] - windows[:count] @ weights)
+    bad = np.flatnonzero((miss > _STARTUP * np.maximum(robust_sigma(miss, axis=0), 1e-12)).any(axis=1))
     end = 0
     for row in bad:
         if row >= end + _SOONEST:
@@ -525,8 +524,7 @@ def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
     shortest = blocks.duration
     longest = 4 * max(blocks.spans)
     times = correlation_times(shortest, longest)
-    indicator = np.eye(blocks.levels)[blocks.level]
-    taken = np.concatenate([indicator, smooth / np.maximum(column_lengths(smooth), 1e-300)], axis=1)
+    taken = np.hstack([blocks.of_level, smooth / np.maximum(column_lengths(smooth), 1e-300)])
     null = scipy.linalg.null_space(taken.T, rcond=1e-9)
     if not null.shape[1]:
         raise NotPossibleError(
@@ -549,16 +547,16 @@ def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
         whole = 1 + _RATIOS[:, None] * np.maximum(values, 0.0)  # (R, m), over the blocks' white variance
         for name, means in left.items():
             power = (vectors.T @ means) ** 2  # (m, 3)
-            scale = np.mean(power.T[:, None] / whole, axis=-1)  # (3, R)
-            scale = np.maximum(scale, _ROUNDING * np.mean(blocks.means[name] ** 2) + 1e-30)  # an axis that is still
-            cost = len(values) * np.log(scale) + np.sum(np.log(whole), axis=-1)
-            best = np.arange(3), np.argmin(cost, axis=1)
+            scale = (power.T[:, None] / whole).mean(axis=-1)  # (3, R)
+            scale = np.maximum(scale, _ROUNDING * (blocks.means[name] ** 2).mean() + 1e-30)  # an axis that is still
+            cost = len(values) * np.log(scale) + np.log(whole).sum(axis=-1)
+            best = np.arange(3), cost.argmin(axis=1)
             variance = (scale[best] * _RATIOS[best[1]])[:, None] * (mixed[0] * flicker + mixed[1] * walk)
             tried[name].append((cost[best], scale[best], variance))
     noise = {}
     for name, fits in tried.items():
         cost, white, variance = (np.stack(values) for values in zip(*fits, strict=True))
-        best = np.argmin(cost, axis=0), np.arange(3)
+        best = cost.argmin(axis=0), np.arange(3)
         usual = _FLICKER**2 * white[best] * shortest * np.log(RATIO) / np.pi
         slowly = np.maximum(variance[best], usual[:, None])
         noise[name] = AxisNoise(white[best] * shortest, nothing, slowly, times, longest / 4)

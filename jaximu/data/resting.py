@@ -23,7 +23,9 @@ from jaximu.estimation.rows import TIME, ResidualKind, Rows
 from jaximu.estimation.track import TRIADS, Track, added, mean_outputs
 from jaximu.estimation.uncertainty import pose_advice
 from jaximu.ground.array_types import Array, FloatArray, IntArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.rotation import Number, apply_matrix
+from jaximu.ground.vectors import sigmas_of
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
@@ -51,8 +53,8 @@ class RestingConditions(Conditions):
     def __call__(self, imu: Imu) -> Float[Array, " 6*n"]:
         """Return the errors of the mean outputs, accelerometer and gyroscope of one block after another."""
         force = apply_matrix(imu.accelerometer.gain, self.force) + imu.accelerometer.bias
-        rate = jnp.broadcast_to(imu.triads()["gyroscope"].bias, force.shape)
-        return (self.output - jnp.concatenate([force, rate], axis=-1)).reshape(-1)
+        rate = jnp.broadcast_to(imu.triad("gyroscope").bias, force.shape)
+        return (self.output - jnp.hstack([force, rate])).ravel()
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ class Resting(OfOneUnit):
     def rows(self, imu: Imu) -> Rows:
         """Return what each condition is: three of the accelerometer, then three of the gyroscope, of each block."""
         count, blocks = len(self.blocks), self.blocks
-        block = np.repeat(np.arange(count), 6)
+        block = np.arange(count).repeat(6)
         return Rows(
             kinds=_RESIDUALS,
             kind=np.tile(np.repeat([0, 1], 3), count),
@@ -92,11 +94,11 @@ class Resting(OfOneUnit):
             to_si=np.tile(1 / self._scale, count),
             used=np.ones(6 * count, bool),
             covariates={
-                TIME: np.repeat(blocks.time, 6),
-                "temperature [°C]": np.repeat(blocks.temperature, 6),
-                "rate of temperature [K/min]": np.repeat(60 * blocks.rate, 6),
+                TIME: blocks.time.repeat(6),
+                "temperature [°C]": blocks.temperature.repeat(6),
+                "rate of temperature [K/min]": (60 * blocks.rate).repeat(6),
             },
-            spans=np.stack([blocks.start, blocks.stop], axis=1),
+            spans=np.column_stack([blocks.start, blocks.stop]),
             observation="block",
         )
 
@@ -118,7 +120,7 @@ class Resting(OfOneUnit):
         count = len(self.blocks)
 
         def of(effect, imu, tracks):
-            return mean_outputs(tracks, added(imu.with_effects(effect), tracks), count).reshape(-1)
+            return mean_outputs(tracks, added(imu.with_effects(effect), tracks), count).ravel()
 
         return f"rest {count}", of, details.tracks
 
@@ -129,8 +131,8 @@ class Resting(OfOneUnit):
 
     def spans(self) -> list[FloatArray]:
         """Return start and stop (k, 2), s, of the blocks of each recording."""
-        edges = np.stack([self.blocks.start, self.blocks.stop], axis=1)
-        return [edges[self.blocks.log == log] for log in range(len(self.recordings))]
+        edges = np.column_stack([self.blocks.start, self.blocks.stop])
+        return [edges[rows] for rows in self.blocks.by_recording]
 
     def extent(self, recording: int = 0) -> Extent:
         """Return what the recordings span: effects may begin with some of the blocks."""
@@ -151,8 +153,7 @@ class Resting(OfOneUnit):
     def parts(self, real: Rows, count: int, interleaved: bool = False) -> list[IntArray]:
         """Return whole ways of the temperature, where there are enough, unless parts are to be interleaved."""
         legs = self.blocks.legs()
-        whole = len(legs) >= WAYS and not interleaved
-        return folds_of(legs) if whole else super().parts(real, count, interleaved)
+        return super().parts(real, count, interleaved) if interleaved or len(legs) < WAYS else folds_of(legs)
 
     def observed(self, imu: Imu, details: _AtRests) -> Observed:
         """Return the blocks; a smooth function of temperature is a shape where it is not allowed beforehand."""
@@ -175,15 +176,15 @@ class Resting(OfOneUnit):
         """Return the recordings of a unit without effects, noise included."""
         blocks, made = self.blocks, []
         means: dict[str, list[FloatArray]] = {name: [] for name in blocks.means}
-        for log, recording in enumerate(blocks.recordings):
-            mine, changed = blocks.log == log, {}
+        for log, (recording, mine) in enumerate(zip(blocks.recordings, blocks.by_recording, strict=True)):
+            changed = {}
             start, stop = blocks.start[mine], blocks.stop[mine]
             for number, (name, triad) in enumerate(imu.triads().items()):
                 signal = recording.signals[name]
-                nearest = np.clip(np.searchsorted(start, signal.time, side="right") - 1, 0, len(start) - 1)
+                nearest = (start.searchsorted(signal.time, side="right") - 1).clip(0, len(start) - 1)
                 true = self._force(imu)[mine][nearest] if name == "accelerometer" else np.zeros((len(signal), 3))
                 changed[name] = twin_signal(signal, triad, true, getattr(noise, name), [seed, log, number])
-                values, edges = changed[name].si(), np.searchsorted(signal.time, np.stack([start, stop], axis=1))
+                values, edges = changed[name].si(), signal.time.searchsorted(np.column_stack([start, stop]))
                 means[name] += [values[a:b].mean(axis=0) for a, b in edges]
             made.append(replace(recording, **changed, notes=()))
         whole = {name: np.stack(parts) for name, parts in means.items()}
@@ -197,7 +198,7 @@ class Resting(OfOneUnit):
     def _outputs(self) -> FloatArray:
         """Mean outputs (n, 6), in output units."""
         offset = np.concatenate([self.recordings[0].signals[name].nominal_offset for name in TRIADS])
-        return np.concatenate([self.blocks.means[name] for name in TRIADS], axis=1) * self._scale + offset
+        return np.hstack([self.blocks.means[name] for name in TRIADS]) * self._scale + offset
 
     def _force(self, imu: Imu) -> FloatArray:
         """The specific force (n, 3) of each block's rest, by the mean over it."""
@@ -213,24 +214,22 @@ class Resting(OfOneUnit):
         curved = self.curves @ self.curves.T if self.smooth else 0.0
         for triad, name in enumerate(TRIADS):
             noise = blocks.covariance(getattr(self.noise, name))
+            columns = 3 * triad + np.arange(3)
+            scale = self._scale[columns]
             covariance = noise + _FREE[triad] ** 2 * (same + curved)
-            for axis in range(3):
-                column = 3 * triad + axis
-                whole[:, column, :, column] = covariance[axis] * self._scale[column] ** 2
-                unit[triad, :, column] = np.sqrt(np.mean(np.diag(noise[axis]))) * self._scale[column]
+            whole[:, columns, :, columns] = covariance * scale[:, None, None] ** 2
+            unit[triad, :, columns] = (rms(sigmas_of(noise), axis=1) * scale)[:, None]
         size = 6 * count
-        factors = tuple(factor.ravel() for factor in unit)
         group = np.tile(np.repeat([0, 1], 3), count)
-        return Covariance(whole.reshape(size, size), factors, np.ones(size), group)
+        return Covariance(whole.reshape(size, size), tuple(unit.reshape(2, size)), np.ones(size), group)
 
     def allowed(self, count: int) -> FloatArray:
         """Return the columns (count, k) of the levels of the rests and of smooth functions, in standard deviations."""
         blocks = self.blocks
         levels = np.equal(blocks.level[:, None], np.unique(blocks.level)).astype(float)
-        shapes = np.concatenate([levels, self.curves], axis=1) if self.smooth else levels
+        shapes = np.hstack([levels, self.curves]) if self.smooth else levels
         columns = np.zeros((len(blocks), 6, shapes.shape[1], 6))
-        for column, size in enumerate(np.repeat(_FREE, 3) * self._scale):
-            columns[:, column, :, column] = size * shapes
+        columns[:, range(6), :, range(6)] = (np.repeat(_FREE, 3) * self._scale)[:, None, None] * shapes
         return columns.reshape(count, -1)
 
     def _added(self, imu: Imu, tracks: Sequence[dict[str, Track]]) -> FloatArray:

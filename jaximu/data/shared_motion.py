@@ -12,7 +12,6 @@ import numpy as np
 from jaximu.data.observe_stations import assembled
 from jaximu.estimation.track import TRIADS
 from jaximu.ground.array_types import FloatArray, IntArray
-from jaximu.ground.differences import midpoints
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording, Signal
@@ -45,10 +44,10 @@ def shared_stations(
     count, length, weight = len(span), np.diff(span)[:, 0], None
     if still:
         means = (means_over(Signal(time, values, "1"), span) for values in (force, rate))
-        force, rate = (np.repeat(mean[:, None], 2, axis=1) for mean in means)
+        force, rate = (mean[:, None].repeat(2, axis=1) for mean in means)
         stimulus = Stimulus(force, rate, angular_acceleration=0 * rate, time=span)
     else:
-        index, held = _held(time, span, gyroscope.rate)
+        index, held = _held(gyroscope.edges - delay, span, gyroscope.rate)
         weight = held / held.sum(axis=1, keepdims=True)
         turning = np.gradient(rate, time, axis=0)
         stimulus = Stimulus(force[index], rate[index], angular_acceleration=turning[index], time=time[index])
@@ -58,12 +57,12 @@ def shared_stations(
     return assembled(means, covariances, stimulus, span, turn, gravity, everywhere, weight=weight)
 
 
-def _held(time: FloatArray, span: FloatArray, rate: float) -> tuple[IntArray, FloatArray]:
-    """Return which samples lie in each span, some beside it included, and how long each holds in it (S, Q), s."""
-    edges = np.concatenate([[2 * time[0] - time[1]], time, [2 * time[-1] - time[-2]]])
-    edges = midpoints(edges)
-    begin = np.searchsorted(edges, span[:, 0], side="right") - 1 - _MARGIN
-    nodes = int(np.ceil(np.max(np.diff(span)) * rate - 1e-6)) + 2 * _MARGIN + 1
-    index = np.clip(begin, 0, len(time) - nodes)[:, None] + np.arange(nodes)
+def _held(edges: FloatArray, span: FloatArray, rate: float) -> tuple[IntArray, FloatArray]:
+    """Return which samples, that hold between edges, lie in each span, some beside it included, and how long each
+    holds in it (S, Q), s.
+    """
+    begin = edges.searchsorted(span[:, 0], side="right") - 1 - _MARGIN
+    nodes = int(np.ceil(np.diff(span).max() * rate - 1e-6)) + 2 * _MARGIN + 1
+    index = begin.clip(0, len(edges) - 1 - nodes)[:, None] + np.arange(nodes)
     held = np.minimum(edges[index + 1], span[:, 1:]) - np.maximum(edges[index], span[:, :1])
     return index, np.maximum(held, 0.0)

@@ -25,7 +25,18 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
-from jaximu.ground.rotation import UP, Number, Numbers, conjugate, exponential, logarithm, multiply, rotate
+from jaximu.ground.rotation import (
+    UP,
+    Number,
+    Numbers,
+    Quaternion,
+    Vector,
+    conjugate,
+    exponential,
+    logarithm,
+    multiply,
+    rotate,
+)
 from jaximu.model.mounting import Mounting
 
 SIZE = 9
@@ -39,11 +50,11 @@ class Standing(NamedTuple):
     the last sample; gravity: m/s².
     """
 
-    attitude: Float[Array, 4]
-    velocity: Float[Array, 3]
-    rate: Float[Array, 3]
-    force: Float[Array, 3]
-    acceleration: Float[Array, 3]
+    attitude: Quaternion
+    velocity: Vector
+    rate: Vector
+    force: Vector
+    acceleration: Vector
     half: Number
     gravity: Number
 
@@ -70,11 +81,11 @@ class Sighting(eqx.Module):
     noise: ClassVar[str]
     absolute: ClassVar[bool] = True
 
-    def off(self, standing: Standing, mounting: Mounting) -> Float[Array, 3]:
+    def off(self, standing: Standing, mounting: Mounting) -> Vector:
         """Return by how much a unit that stands so differs from what was measured."""
         raise NotImplementedError
 
-    def placed(self, attitude: Float[Array, 4], mounting: Mounting) -> Float[Array, 4]:
+    def placed(self, attitude: Quaternion, mounting: Mounting) -> Quaternion:
         """Return the attitude that was measured, as far as it was, else the one given."""
         return attitude
 
@@ -87,12 +98,12 @@ class AttitudeSeen(Sighting):
 
     noise = "reference"
 
-    def off(self, standing: Standing, mounting: Mounting) -> Float[Array, 3]:
+    def off(self, standing: Standing, mounting: Mounting) -> Vector:
         """Return the rotation vector, in the reference's body, from what was measured to what it should be (rad)."""
         expected = mounting.reported(standing.after(self._ahead(mounting)).attitude)
         return logarithm(multiply(conjugate(self.value), expected))
 
-    def placed(self, attitude: Float[Array, 4], mounting: Mounting) -> Float[Array, 4]:
+    def placed(self, attitude: Quaternion, mounting: Mounting) -> Quaternion:
         """Return the unit's attitude, to the level frame, as the reference has it."""
         return mounting.unit_attitude(self.value)
 
@@ -102,7 +113,7 @@ class VelocitySeen(Sighting):
 
     noise = "velocity"
 
-    def off(self, standing: Standing, mounting: Mounting) -> Float[Array, 3]:
+    def off(self, standing: Standing, mounting: Mounting) -> Vector:
         """Return the velocity less what was measured (m/s), in the reference's level frame."""
         ahead = self._ahead(mounting)
         there = standing.after(ahead)
@@ -117,11 +128,11 @@ class FieldSeen(Sighting):
     noise = "field"
     absolute = False
 
-    def off(self, standing: Standing, mounting: Mounting) -> Float[Array, 3]:
+    def off(self, standing: Standing, mounting: Mounting) -> Vector:
         """Return the field less what was measured (µT), body frame."""
         return rotate(conjugate(standing.attitude), mounting.field) - self.value
 
-    def placed(self, attitude: Float[Array, 4], mounting: Mounting) -> Float[Array, 4]:
+    def placed(self, attitude: Quaternion, mounting: Mounting) -> Quaternion:
         """Return the attitude turned about the vertical to where the level parts of both fields point alike."""
         east, north, _ = rotate(attitude, self.value)
         eastward, northward, _ = mounting.field

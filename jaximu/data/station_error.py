@@ -20,6 +20,6 @@ def turntable_error(imu: Imu, stations: Stations) -> Float[Array, "6 S"]:
     used = stations.accelerometer_used, stations.gyroscope_used
     rows = []
     for mean, output, there in zip(means, outputs, used, strict=True):
-        expected = mean if output is None else jnp.sum(stations.weight[..., None] * output, axis=-2)
+        expected = mean if output is None else (stations.weight[..., None] * output).sum(axis=-2)
         rows.append(jnp.where(there[:, None], mean - expected, 0.0).T)
     return jnp.concatenate(rows)

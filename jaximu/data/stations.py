@@ -19,6 +19,7 @@ from jaximu.ground.array_types import Array, IntArray
 from jaximu.ground.distributions import rms
 from jaximu.ground.rotation import Number
 from jaximu.ground.tracing import lifted, on_host, part_of
+from jaximu.ground.vectors import column_lengths
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Stations
 
@@ -41,7 +42,7 @@ class StationConditions(Conditions):
 
     def __call__(self, imu: Imu) -> Float[Array, " 6*S"]:
         """Return the errors, zero where a station is not used."""
-        return turntable_error(imu, self.stations).T.reshape(-1)
+        return turntable_error(imu, self.stations).T.ravel()
 
     def at_magnitude(self, magnitude: Number) -> StationConditions:
         """Return the same with another gravity: specific force is in proportion to it."""
@@ -54,29 +55,29 @@ def station_rows(imu: Imu, stations: Stations) -> Rows:
     """Return what each error of a mean output is, by a unit close to this one."""
     stations = on_host(stations)
     count, turn, start, stop = len(stations.turn), stations.turn, stations.start, stations.stop
-    station, stimulus = np.repeat(np.arange(count), 6), stations.stimulus
-    kind = np.repeat(np.stack([np.zeros(count, np.int64), np.where(turn, 1, 2)], axis=1), 3, axis=1).ravel()
-    covariates = {TIME: np.repeat((start + stop) / 2, 6)}
+    station, stimulus = np.arange(count).repeat(6), stations.stimulus
+    kind = np.column_stack([np.zeros(count, np.int64), np.where(turn, 1, 2)]).repeat(3, axis=1).ravel()
+    covariates = {TIME: ((start + stop) / 2).repeat(6)}
     if stimulus.temperature is not None:
-        covariates[TEMPERATURE] = np.repeat(np.asarray(stimulus.temperature).mean(axis=1), 6)
+        covariates[TEMPERATURE] = np.asarray(stimulus.temperature).mean(axis=1).repeat(6)
     force, rate = (
-        np.repeat(np.asarray(vectors).mean(axis=1), 6, axis=0)
+        np.asarray(vectors).mean(axis=1).repeat(6, axis=0)
         for vectors in (stimulus.specific_force, stimulus.angular_rate)
     )
     turning = (kind == 1)[:, None]
     covariates |= by_axis("specific force", "m/s²", np.where(turning, np.nan, force))
     covariates |= by_axis("rate", "°/s", np.where(turning, np.degrees(rate), np.nan))
     scale = [triad.scales for triad in imu.triads().values()]
-    used = np.stack([stations.accelerometer_used, stations.gyroscope_used], axis=1)
+    used = np.column_stack([stations.accelerometer_used, stations.gyroscope_used])
     return Rows(
         kinds=RESIDUALS,
         kind=kind,
         first=station,
         last=station,
         to_si=1 / np.tile(np.concatenate([*scale, np.ones(3)])[:6], count),
-        used=np.repeat(used, 3, axis=1).ravel(),
+        used=used.repeat(3, axis=1).ravel(),
         covariates=covariates,
-        spans=np.stack([start, stop], axis=1),
+        spans=np.column_stack([start, stop]),
     )
 
 
@@ -88,13 +89,11 @@ def station_excess(stations: Stations) -> Float[Array, "3 6 S"]:
     covariance = jnp.concatenate([stations.accelerometer_covariance, stations.gyroscope_covariance])
     accelerometer, gyroscope = stations.accelerometer_used, stations.gyroscope_used
     none = jnp.zeros_like(accelerometer)
-    kinds = [(accelerometer, none), (none, gyroscope & stations.turn), (none, gyroscope & ~stations.turn)]
-    diagonal, units = covariance.diagonal(axis1=-2, axis2=-1), []
-    for first, second in kinds:
-        member = jnp.repeat(jnp.stack([first, second]), 3, axis=0).astype(diagonal.dtype)
-        mean = jnp.sum(member * diagonal, axis=-1) / jnp.maximum(jnp.sum(member, axis=-1), 1.0)
-        units.append(member * mean[:, None])
-    return jnp.stack(units)
+    kinds = [[accelerometer, none], [none, gyroscope & stations.turn], [none, gyroscope & ~stations.turn]]
+    diagonal = covariance.diagonal(axis1=-2, axis2=-1)
+    member = jnp.array(kinds).repeat(3, axis=1).astype(diagonal.dtype)
+    mean = (member * diagonal).sum(axis=-1) / jnp.maximum(member.sum(axis=-1), 1.0)
+    return member * mean[..., None]
 
 
 def station_weights(stations: Stations, excess: Float[Array, " 3"]) -> Float[Array, "6 S S"]:
@@ -109,19 +108,19 @@ def turntable(imu: Imu, stations: Stations, weights: Float[Array, "6 S S"]) -> F
 
     **Arguments:** `weights`: the inverse Cholesky factor of each axis's covariance, from `station_weights`.
     """
-    return jnp.sum(weights * turntable_error(imu, stations)[:, None, :], axis=-1).reshape(-1)
+    return (weights * turntable_error(imu, stations)[:, None, :]).sum(axis=-1).ravel()
 
 
 def station_covariance(stations: Stations) -> Covariance:
     """Return the covariance of the errors, with an excess of poses, of turns and of the gyroscope at rest."""
     measured = jnp.concatenate([stations.accelerometer_covariance, stations.gyroscope_covariance])
-    used = jnp.repeat(jnp.stack([stations.accelerometer_used, stations.gyroscope_used]), 3, axis=0).astype(float)
+    used = jnp.stack([stations.accelerometer_used, stations.gyroscope_used]).repeat(3, axis=0).astype(float)
     masked = used[:, :, None] * used[:, None, :] * measured
     whole = jnp.einsum("ast,ab->satb", masked, jnp.eye(len(masked))).reshape((used.size,) * 2)
-    factors = tuple(jnp.sqrt(unit.T.reshape(-1)) for unit in station_excess(stations))
+    factors = tuple(jnp.sqrt(unit.T.ravel()) for unit in station_excess(stations))
     kind = jnp.where(stations.turn, 1, 2)
-    group = jnp.repeat(jnp.stack([jnp.zeros_like(kind), kind], axis=1), 3, axis=1).reshape(-1)
-    return Covariance(whole, factors, used.T.reshape(-1), group)
+    group = jnp.column_stack([jnp.zeros_like(kind), kind]).repeat(3, axis=1).ravel()
+    return Covariance(whole, factors, used.T.ravel(), group)
 
 
 class KnownStations(Data):
@@ -192,7 +191,7 @@ def station_errors(imu: Imu, stations: Stations, excess: np.ndarray) -> list[Sta
 def station_rms(imu: Imu, stations: Stations) -> Sizes:
     """Return the rms of each kind of error, as vectors, with its unit."""
     return {
-        kind.name: (rms(np.linalg.norm(kind.error, axis=0)), kind.unit)
+        kind.name: (rms(column_lengths(kind.error)), kind.unit)
         for kind in station_errors(imu, stations, np.zeros(len(KnownStations.coarse)))
         if len(kind.station)
     }

@@ -63,7 +63,7 @@ class SamplesByHand(eqx.Module):
                 sample[number, : len(inside)] = inside
                 turn[inside], order[inside] = number, np.arange(len(inside))
         nearest = {
-            name: np.clip(np.searchsorted(gyroscope.time, signal.time - 0.5 / gyroscope.rate), 0, len(gyroscope) - 1)
+            name: gyroscope.time.searchsorted(signal.time - 0.5 / gyroscope.rate).clip(0, len(gyroscope) - 1)
             for name, signal in signals.items()
         }
         outputs = {name: signal.values - (shift if name == "gyroscope" else 0.0) for name, signal in signals.items()}
@@ -113,8 +113,7 @@ def samples_by_hand(segmentations: Sequence[Segmentation], observations: Observa
     for part, shift in zip(segmentations, rest_shifts(segmentations), strict=True):
         samples.append(SamplesByHand.of(part, first, interval, shift))
         first += len(part.intervals)
-    starts = one_after_another([part.recording for part in segmentations])
-    if starts:
+    if starts := one_after_another([part.recording for part in segmentations]):
         samples = [
             replace(of, recorded=of.recorded.in_session(start)) for of, start in zip(samples, starts, strict=True)
         ]
@@ -170,7 +169,7 @@ def tracks_by_hand(imu: Imu, samples: SamplesByHand, running: Float[Array, "T S 
 
 def _pose_of(signal: Signal, intervals: FloatArray, first: int) -> IntArray:
     """The pose each sample lies in."""
-    pose = np.searchsorted(intervals[:, 0], signal.time, side="right") - 1
+    pose = intervals[:, 0].searchsorted(signal.time, side="right") - 1
     inside = (pose >= 0) & (signal.time < intervals[np.maximum(pose, 0), 1])
     return np.where(inside, first + pose, _NONE)
 

@@ -11,7 +11,7 @@ from jaximu.data.poses import PosesAndTurns
 from jaximu.data.twin_signal import twin_signal
 from jaximu.estimation.track import Track
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.rotation import rotation_matrix, unit_vectors
+from jaximu.ground.rotation import UP, rotation_matrix, unit_vectors
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording
@@ -56,7 +56,7 @@ def twin_recordings(
         for k in range(first, first + len(part.intervals) - 1):
             if turns.mask[k]:
                 inside = samples.sample[k][turns.interval[k] > 0]
-                rate[inside] += _correction(attitude[inside], up[k + 1], float(np.sum(turns.interval[k])))
+                rate[inside] += _correction(attitude[inside], up[k + 1], float(turns.interval[k].sum()))
         first += len(part.intervals)
         changed = {}
         for order, ((name, triad), values) in enumerate(zip(imu.triads().items(), (force, rate), strict=True)):
@@ -73,8 +73,6 @@ def _correction(attitude: FloatArray, after: FloatArray, duration: float) -> Flo
     is the sum of the rates' parts brought there.
     """
     matrix = rotation_matrix(attitude)  # body to level
-    lab = np.array([0.0, 0.0, 1.0])
-    delta = np.cross(after, matrix[-1].T @ lab)  # turning the frame by δ moves a fixed direction by −δ × u
+    delta = np.cross(after, matrix[-1].T @ UP)  # turning the frame by δ moves a fixed direction by −δ × u
     # δ in the last frame is R_kᵀ-transported to each sample's own frame
-    back = np.einsum("nji,jk,k->ni", matrix, matrix[-1], delta)
-    return back / max(duration, 1e-9)
+    return np.einsum("nji,jk,k->ni", matrix, matrix[-1], delta) / max(duration, 1e-9)
