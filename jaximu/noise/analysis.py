@@ -15,6 +15,7 @@ from jaximu.ground.errors import FilePath, InputError, NotPossibleError
 from jaximu.ground.page import Result
 from jaximu.ground.quantities import size
 from jaximu.ground.units import SENSOR_QUANTITIES
+from jaximu.ground.vectors import column_lengths
 from jaximu.mistakes import Prepared, prepared
 from jaximu.model.data_sheet import SI_UNITS
 from jaximu.noise.cleaning import PeriodicLine, without_outliers
@@ -94,8 +95,7 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
     that is too short or moves, `InputError` for uneven stamps and for a sensor that holds no measurement; a gyroscope
     that holds none is left out beside an accelerometer, with a note.
     """
-    recordings = recordings_of(recordings)
-    if not recordings:
+    if not (recordings := recordings_of(recordings)):
         raise InputError("no recording was given.")
     alone = not any(len(recording.accelerometer) for recording in recordings)
     with prepared(recordings, gyroscope=alone, gravity=False) as ready:
@@ -218,13 +218,13 @@ def evenly_sampled(signal: Signal, what: str = "the signal") -> tuple[FloatArray
     if len(signal) < 3:
         raise NotPossibleError(f"{what} has only {len(signal)} samples.")
     interval = np.diff(signal.time)
-    steps = np.maximum(1, np.round(interval / np.median(interval))).astype(np.int64)
+    steps = np.maximum(1, (interval / np.median(interval)).round()).astype(np.int64)
     index = np.cumulative_sum(steps, include_initial=True)
     slope, start = np.polyfit(index, signal.time, 1)
-    off = np.abs(signal.time - start - slope * index) / slope
-    if np.mean(off > _UNEVEN) > 0.01:
+    off = abs(signal.time - start - slope * index) / slope
+    if (off > _UNEVEN).mean() > 0.01:
         raise InputError(
-            f"{what} is sampled unevenly: {100 * np.mean(off > _UNEVEN):.0f} % of its stamps are more than a quarter "
+            f"{what} is sampled unevenly: {100 * (off > _UNEVEN).mean():.0f} % of its stamps are more than a quarter "
             "of an interval off an even grid. If the rate is steady and only the stamps are not, ignore their column "
             "(_ in --columns) and give --rate."
         )
@@ -282,7 +282,7 @@ def _require_rest(values: FloatArray, rate: float, step: float, what: str) -> No
     if seconds.shape[1] < 8:
         return
     whole = seconds[:, ~np.isnan(seconds[0]).any(axis=1)]
-    scatter = np.sum(np.var(whole, axis=2), axis=0)
+    scatter = whole.var(axis=2).sum(axis=0)
     if not (scatter > 0).any():
         return
     usual = float(np.median(scatter[scatter > 0]))
@@ -290,12 +290,12 @@ def _require_rest(values: FloatArray, rate: float, step: float, what: str) -> No
     why = f"{moving.sum()} of {len(moving)} seconds scatter more than {_MOVING:g} times the median one"
     limit = 0.002
     if moving.mean() <= limit:
-        steps = np.linalg.norm(np.diff(np.mean(whole, axis=2), axis=1), axis=0)
+        steps = column_lengths(np.diff(whole.mean(axis=2), axis=1))
         moving = steps > max(6 * np.sqrt(2 * usual / length), step)
         why = f"the means of {moving.sum()} of {len(moving)} pairs of seconds differ by far more than their scatter"
         limit = 0.01
     if moving.mean() > limit:
         raise NotPossibleError(
-            f"{what} did not rest: {why}, the first about {np.argmax(moving) * length / rate:.0f} s in. Record the "
+            f"{what} did not rest: {why}, the first about {moving.argmax() * length / rate:.0f} s in. Record the "
             "unit at rest, on something heavy, for an hour or more, and cut off the ends."
         )

@@ -44,8 +44,7 @@ def _of_ready(ready: Prepared) -> NoiseModel:
         values = np.stack([filled(axis, BRIDGED) for axis in values])
         first, last = max(runs_of(np.asarray(np.isfinite(values).all(axis=0))), key=np.ptp)
         whole = values[:, first:last]
-        samples = last - first
-        if samples < values.shape[1]:
+        if (samples := last - first) < values.shape[1]:
             notes.append(
                 f"{what} has gaps: its noise is that of the longest part without, {samples / rate:.0f} of "
                 f"{values.shape[1] / rate:.0f} s."

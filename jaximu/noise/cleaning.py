@@ -40,7 +40,7 @@ def without_outliers(values: FloatArray) -> tuple[FloatArray, int]:
     a property of the noise, and stay.
     """
     middle = values[1:-1] - (values[:-2] + values[2:]) / 2
-    sizes = np.abs(middle[~np.isnan(middle)])
+    sizes = abs(middle[~np.isnan(middle)])
     if not len(sizes):
         return values, 0
     scale = robust_sigma(sizes)
@@ -50,15 +50,15 @@ def without_outliers(values: FloatArray) -> tuple[FloatArray, int]:
     if scale < 1e-12 * sizes.max() or len(steps) < 0.9 * len(sizes):
         # quantised: most differences are equal or none, and their median is a matter of a step
         scale = max(scale, float(np.quantile(sizes, 0.99)) / 2.576, float(steps.min()))
-    suspected = 1 + np.flatnonzero(np.abs(middle) > _SPIKE / 2 * scale)  # of two spikes in a row each shows half
+    suspected = 1 + np.flatnonzero(abs(middle) > _SPIKE / 2 * scale)  # of two spikes in a row each shows half
     if not len(suspected) or len(suspected) > 0.01 * len(values):
         return values, 0
-    near = np.unique(np.clip(suspected[:, None] + np.arange(-2, 3), 0, len(values) - 1))
-    around = np.clip(near[:, None] + np.arange(-8, 9), 0, len(values) - 1)
+    near = np.unique((suspected[:, None] + np.arange(-2, 3)).clip(0, len(values) - 1))
+    around = (near[:, None] + np.arange(-8, 9)).clip(0, len(values) - 1)
     level = np.nanmedian(values[around], axis=1)
-    usual = 1.4826 * np.nanmedian(np.abs(values[around] - level[:, None]), axis=1)
+    usual = 1.4826 * np.nanmedian(abs(values[around] - level[:, None]), axis=1)
     # where the signal itself wanders, as a walk does, the scatter around says how far a sample may be
-    far = near[np.abs(values[near] - level) > _SPIKE * np.maximum(scale, usual)]
+    far = near[abs(values[near] - level) > _SPIKE * np.maximum(scale, usual)]
     if len(far) > 1e-3 * len(values):
         return values, 0
     if len(far):
@@ -120,7 +120,7 @@ def periodic_lines(
             line, wave = _wave(rest, peak, rate)
             lines.append(line)
             spans.append((low, high))
-            rest = rest - wave
+            rest -= wave
             periodic = wave if periodic is None else periodic + wave
             news = True
         if not news:
@@ -155,7 +155,7 @@ def _peaks(values: FloatArray, last: int | None) -> list[tuple[int, int, int]]:
         return []
     factor = np.log(len(power) / FALSE_LINE) / np.log(2)
     first = int(np.sqrt((edges[0] + 1.0) * (edges[1] + 1.0)))
-    crude = np.repeat(median, np.diff(edges)) * (0.4 * factor)
+    crude = median.repeat(np.diff(edges)) * (0.4 * factor)
     high = edges[0] + np.flatnonzero(power[edges[0] : edges[-1]] > crude)
     high = high[high >= first]
     if not len(high):
@@ -166,21 +166,20 @@ def _peaks(values: FloatArray, last: int | None) -> list[tuple[int, int, int]]:
     for group in np.split(high, 1 + np.flatnonzero(np.diff(high) > 6)):
         if len(group):
             low, last = _skirts(power, int(group[0]), int(group[-1]))
-            peaks.append((low + 1, int(group[np.argmax(power[group])]) + 1, last + 1))
+            peaks.append((low + 1, int(group[power[group].argmax()]) + 1, last + 1))
     return sorted(peaks, key=lambda peak: -power[peak[1] - 1])
 
 
 def _skirts(power: FloatArray, low: int, high: int) -> tuple[int, int]:
     """Widen a peak to where its power falls to twice that around: a line whose frequency wanders has skirts."""
     sides = [power[int(0.7 * low) : int(0.85 * low)], power[int(1.18 * high) : int(1.4 * high)]]
-    levels = [np.median(side) / np.log(2) for side in sides if len(side) >= 16]
-    if not levels:
+    if not (levels := [np.median(side) / np.log(2) for side in sides if len(side) >= 16]):
         return low, high
-    limit = 2 * np.exp(np.mean(np.log(levels)))
+    limit = 2 * np.exp(np.log(levels).mean())
     first, last = low, high
-    while low > 0.85 * first and low > 8 and np.mean(power[low - 8 : low]) > limit:
+    while low > 0.85 * first and low > 8 and power[low - 8 : low].mean() > limit:
         low -= 4
-    while high < 1.18 * last and high + 9 < len(power) and np.mean(power[high + 1 : high + 9]) > limit:
+    while high < 1.18 * last and high + 9 < len(power) and power[high + 1 : high + 9].mean() > limit:
         high += 4
     return low, high
 
@@ -214,7 +213,7 @@ def _wave(values: FloatArray, peak: int, rate: float) -> tuple[PeriodicLine, Flo
     middle = (np.arange(blocks) * size + (size - 1) / 2) / samples
 
     # where the line is highest
-    shift = lowest(lambda at: -np.abs(np.sum(coarse * np.exp(circle * at * middle))), (-1.0, 1.0), 1e-7)
-    turn = turn * np.exp(circle * shift / samples * index)
-    phasor = 2 * np.sum(values * turn * taper) / np.sum(taper)
-    return PeriodicLine((peak + shift) * rate / samples, float(np.abs(phasor))), np.asarray((phasor * turn.conj()).real)
+    shift = lowest(lambda at: -abs((coarse * np.exp(circle * at * middle)).sum()), (-1.0, 1.0), 1e-7)
+    turn *= np.exp(circle * shift / samples * index)
+    phasor = 2 * (values * turn * taper).sum() / taper.sum()
+    return PeriodicLine((peak + shift) * rate / samples, float(abs(phasor))), np.asarray((phasor * turn.conj()).real)

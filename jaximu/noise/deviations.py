@@ -71,15 +71,14 @@ def averaging_factors(samples: int, kind: str = "overlapping", spacing: str | in
     """Return the numbers of samples to average: octaves (1, 2, 4 …), decades (1, 2, 4, 10, 20, 40 …), or so many spaced
     evenly in their logarithm. The longest leaves at least two differences (one degree of freedom apart from the mean).
     """
-    longest = _longest(samples, kind)
-    if longest < 1:
+    if (longest := _longest(samples, kind)) < 1:
         raise NotPossibleError(f"{samples} samples are too few for the {kind} deviation.")
     if spacing == "octave":
         factors = 2 ** np.arange(int(np.log2(longest)) + 1)
     elif spacing == "decade":
         factors = np.multiply.outer((1, 2, 4), 10 ** np.arange(1 + int(np.log10(longest)))).ravel()
     elif isinstance(spacing, int) and spacing > 0:
-        factors = np.round(np.geomspace(1, longest, spacing))
+        factors = np.geomspace(1, longest, spacing).round()
     else:
         raise InputError(f"spacing must be 'octave', 'decade' or a number of averaging times, found {spacing!r}.")
     factors = np.unique(factors.astype(np.int64))
@@ -366,12 +365,12 @@ def degrees_of_freedom(kind: str, points: int, factor: int, exponent: int, lag: 
         shared = [max(0.0, 1 - k * stride / terms) * (w / middle) ** 2 for k, w in enumerate(others, start=1)]
         return terms / (1 + 2 * sum(shared))
     if stride > _FINE:  # the sum is smooth in its index: as many terms of a coarser grid give the same
-        terms = terms * _FINE / stride
+        terms *= _FINE / stride
         stride = _FINE
     highest = int(min(terms, (d + 1) * stride))
     shape = _correlation(d, exponent, filtering, stride, highest)
     j = np.arange(1, highest)
-    total = 1.0 + (1 - highest / terms) * shape[highest] + 2 * np.sum((1 - j / terms) * shape[1:-1])
+    total = 1.0 + (1 - highest / terms) * shape[highest] + 2 * ((1 - j / terms) * shape[1:-1]).sum()
     return float(max(1.0, terms / total))
 
 
@@ -386,7 +385,7 @@ def _correlation(d: int, exponent: int, filtering: float, stride: float, highest
     """Squared autocorrelation of the differences at 0 … `highest` terms of `stride` an averaging time."""
 
     def walk(t):  # s_w
-        t = np.abs(t)
+        t = abs(t)
         with np.errstate(divide="ignore", invalid="ignore"):
             logarithm = np.where(t > 0, np.log(np.where(t > 0, t, 1.0)), 0.0)
         power = exponent + (2 if filtering > _FINE else 0)

@@ -60,7 +60,7 @@ def _mean_term(terms: Sequence[Term | None]) -> MeanTerm | None:
         return None
     squares = np.array([(t.low, t.value, min(t.high, 1e20 * t.value)) for t in present.values()]) ** 2  # finite if open
     mean = float(squares[:, 1].sum() / len(terms))
-    below, above = (np.sqrt(np.sum((squares[:, 1] - squares[:, end]) ** 2)) / len(terms) for end in (0, 2))
+    below, above = (np.sqrt(((squares[:, 1] - squares[:, end]) ** 2).sum()) / len(terms) for end in (0, 2))
     return MeanTerm(math.sqrt(mean), math.sqrt(max(mean - below, 0.0)), math.sqrt(mean + above), "".join(present))
 
 

@@ -157,8 +157,7 @@ def identify(
 def _identify(
     values: FloatArray, rate: float, terms: str, confidence: float, markov: int, highest: float | None
 ) -> Identified:
-    samples = len(values)
-    if samples < _SHORTEST:
+    if (samples := len(values)) < _SHORTEST:
         raise NotPossibleError(f"{samples} samples are too few to identify noise; record at least {_SHORTEST}.")
     there = np.flatnonzero(~np.isnan(values))
     if len(there) < _SHORTEST:
@@ -172,32 +171,28 @@ def _identify(
     if highest is not None:
         bands = [*bands, (highest, rate / 2)]
     if periodic is not None:
-        whole = whole - periodic
-        values = values - periodic
+        whole, values = whole - periodic, values - periodic
     spectrum = _spectrum(whole, rate, bands)
-    warm_up = _warm_up(spectrum, terms)
-    if warm_up is not None:
+    if (warm_up := _warm_up(spectrum, terms)) is not None:
         drift = warm_up.amplitude * np.exp(-np.arange(len(whole)) / (rate * warm_up.time_constant))
-        whole = whole - drift
         values = values - drift
-        spectrum = _spectrum(whole, rate, bands)
+        spectrum = _spectrum(whole - drift, rate, bands)
     measured = _deviation(filled(values, BRIDGED), rate, confidence)
     if not (measured.value > 0).all():
         raise NotPossibleError(_CONSTANT)
     threshold = float(chi2_isf(1 - confidence, 1)) / 2
     # How far the most general model is off, octave by octave, then which of its terms are needed
     general = _Model(spectrum, terms, _times(spectrum, terms, markov)).fit()
-    misfit, freedom = general.misfit()
     excess, high_pass, offered = 0.0, None, terms
-    if misfit > chi2_isf(1 - confidence, freedom) and not markov:
+    if general.unlike(1 - confidence) and not markov:
         high_pass = _high_pass(general, threshold)
     if high_pass is not None:
         offered = terms.replace("R", "")
         general = replace(general.model, spectrum=replace(spectrum, high_pass=high_pass.value), terms=offered).fit()
-    elif misfit > chi2_isf(_UNLIKELY, freedom):
+    elif general.unlike(_UNLIKELY):
         # The terms do not describe this noise, and the high frequencies, known best, would dictate all others. Every
         # octave may then differ from the terms by a share that makes the misfit what it should be.
-        excess = _excess(general, freedom)
+        excess = _excess(general)
     best = _select(replace(general.model, excess=excess), offered)
     result = dict.fromkeys(terms) | {
         term: _term(best, index, threshold) for index, term in enumerate(best.model.letters)
@@ -339,11 +334,11 @@ def _binned(coefficient: FloatArray, rate: float, slope: float, bands: Sequence[
         first, last = (round(2 * samples * f / rate) for f in (low, high))
         keep[max(first, 1) : max(last, 0) + 1] = 0.0
     count = np.add.reduceat(keep, edges[:-1])
-    sums = np.add.reduceat(np.square(coefficient) * keep, edges[:-1])
+    sums = np.add.reduceat(coefficient**2 * keep, edges[:-1])
     used = count > 0
-    number = np.where(used, np.cumsum(used) - 1, -1)
+    number = np.where(used, used.cumsum() - 1, -1)
     low = min(samples - 1, _RAMPED)
-    inside = number[np.searchsorted(edges, np.arange(1, low + 1), side="right") - 1]
+    inside = number[edges.searchsorted(np.arange(1, low + 1), side="right") - 1]
     inside = np.where(keep[1 : low + 1] > 0, inside, -1)
     return _Spectrum(
         samples,
@@ -392,7 +387,7 @@ def _markov(spectrum: _Spectrum, correlation_time: float) -> FloatArray:
     half = spectrum.angle / 2
     gap = 2 * np.sinh(p / 2) ** 2 + 2 * np.sin(half) ** 2
     # single places are even or odd; among many the signs cancel
-    sign = np.where(spectrum.node == np.round(spectrum.node), np.where(spectrum.node % 2 == 0, 1.0, -1.0), 0.0)
+    sign = np.where(spectrum.node == spectrum.node.round(), np.where(spectrum.node % 2 == 0, 1.0, -1.0), 0.0)
     ends = 1 - sign * np.exp(-p * spectrum.samples)
     edge = 4 / spectrum.samples * np.sinh(p / 2) ** 2 * np.cos(half) ** 2 * ends / gap**2
     return (np.sinh(p) / gap - edge) / spectrum.rate
@@ -425,8 +420,7 @@ class _Model:
     def weight(self) -> FloatArray:
         """Effective number (B,) of coefficients: with an excess e, that of an octave of M tells no more than 2/e²."""
         count = self.spectrum.count
-        total = np.bincount(self.spectrum.octave, count)[self.spectrum.octave]
-        return count / (1 + self.excess**2 * total / 2)
+        return count / (1 + self.excess**2 * np.bincount(self.spectrum.octave, count)[self.spectrum.octave] / 2)
 
     @cached_property
     def columns(self) -> FloatArray:
@@ -459,9 +453,8 @@ class _Model:
     def gram(self) -> FloatArray:
         """Means (B, drifts, drifts) of products of the regressors."""
         rows = self.regressors
-        size = len(self.regressors)
         products = [self.spectrum.products(a, b) for a in rows for b in rows]
-        return np.reshape(products, (size, size, len(self.spectrum.count))).T
+        return np.reshape(products, (len(rows), len(rows), len(self.spectrum.count))).T
 
     def variance(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Variance (B,), and its derivative (B, parameters) over it."""
@@ -469,11 +462,10 @@ class _Model:
         parts = [self.columns * np.exp(theta[:count])]
         for i in range(len(self.times)):
             log_variance, log_time = theta[count + 2 * i : count + 2 * i + 2]
-            spectrum = self.spectrum
             step = 1e-4
-            below, above = (_markov(spectrum, np.exp(log_time + s)) @ _WEIGHT for s in (-step, step))
-            parts.append(np.exp(log_variance) * np.stack([(below + above) / 2, (above - below) / (2 * step)], axis=1))
-        shares = np.concatenate(parts, axis=1)
+            below, above = (_markov(self.spectrum, np.exp(log_time + s)) @ _WEIGHT for s in (-step, step))
+            parts.append(np.exp(log_variance) * np.column_stack([(below + above) / 2, (above - below) / (2 * step)]))
+        shares = np.hstack(parts)
         processes = [*range(count), *range(count, shares.shape[1], 2)]
         variance = np.maximum(shares[:, processes].sum(axis=1), 1e-300)
         return variance, shares / variance[:, None]
@@ -499,7 +491,7 @@ class _Model:
 
         def largest(column: FloatArray) -> float:
             mean = np.bincount(spectrum.octave, spectrum.count * column)
-            return np.log(max(np.min(power[mean > 0] / mean[mean > 0]), 1e-290))
+            return np.log(max((power[mean > 0] / mean[mean > 0]).min(), 1e-290))
 
         theta = [largest(column) for column in self.columns.T]
         for time in self.times:
@@ -528,7 +520,7 @@ class _Model:
             if not live.any():
                 break
             part = submatrix(fisher, live) + np.diag((damping + 1e-12) * diagonal[live])
-            step = np.clip(np.linalg.solve(part, slope[live]), -2.0, 2.0)
+            step = np.linalg.solve(part, slope[live]).clip(-2.0, 2.0)
             trial = theta.copy()
             trial[free[live]] += step
             *parts, trial_loss = evaluate(trial)
@@ -536,11 +528,11 @@ class _Model:
                 gain = loss - trial_loss
                 theta, (shares, sizes, ratio), loss = trial, parts, trial_loss
                 damping = max(damping / 10, 1e-9)
-                if gain < 1e-7 and np.abs(step).max() < 1e-2:
+                if gain < 1e-7 and abs(step).max() < 1e-2:
                     break
             else:
                 damping = max(damping * 10, 1e-6)
-                if damping > 1e8 or np.abs(step).max() < 1e-9:
+                if damping > 1e8 or abs(step).max() < 1e-9:
                     break
         return _Fit(self, theta, sizes, loss, shares, ratio)
 
@@ -591,8 +583,13 @@ class _Fit:
         total = np.bincount(octave, weight)
         mean = np.bincount(octave, weight * self.ratio)[total > 0] / total[total > 0]
         total = total[total > 0]
-        taken = int(np.sum(self.information() > 0.05)) + len(self.sizes)
-        return float(np.sum(total * (mean - 1 - np.log(mean)))), max(1, len(total) - taken)
+        taken = int((self.information() > 0.05).sum()) + len(self.sizes)
+        return float((total * (mean - 1 - np.log(mean))).sum()), max(1, len(total) - taken)
+
+    def unlike(self, probability: float) -> bool:
+        """Whether the noise is unlike the terms: by chance the misfit is as large with less than a probability."""
+        misfit, freedom = self.misfit()
+        return bool(misfit > chi2_isf(probability, freedom))
 
 
 def _times(spectrum: _Spectrum, terms: str, count: int) -> tuple[float, ...]:
@@ -627,16 +624,15 @@ def _select(general: _Model, terms: str) -> _Fit:
     return chosen
 
 
-def _excess(general: _Fit, freedom: int) -> float:
+def _excess(general: _Fit) -> float:
     """Return the share by which octaves differ from the most general model, so that its misfit is its freedom."""
+    freedom = general.misfit()[1]
 
     def over(logarithm: float) -> float:
         return replace(general.model, excess=np.exp(logarithm)).fit().misfit()[0] - freedom
 
     low, high = np.log(1e-3), np.log(2.0)
-    if over(low) <= 0:
-        return float(np.exp(low))
-    return float(np.exp(_root(over, low, high, 0.02)))
+    return float(np.exp(low if over(low) <= 0 else _root(over, low, high, 0.02)))
 
 
 def _root(function: Callable[[float], float], low: float, high: float, tolerance: float) -> float:
@@ -694,7 +690,6 @@ def _limit(fit: _Fit, term: str, threshold: float) -> float:
         return max(map(abs, _ramp_bounds(beside, threshold)))
     index = beside.model.letters.index(term)
     most = beside.model.start()[index]
-
     root = _root(lambda at: beside.held(index, at) - threshold, max(beside.theta[index], most - 25), most + 12, 1e-2)
     return float(np.exp(root / 2))
 
@@ -715,13 +710,11 @@ def _high_pass(general: _Fit, threshold: float) -> Term | None:
     def loss(logarithm: float) -> float:
         return at(logarithm).loss
 
-    losses = list(map(loss, grid))
-    if 2 * (general.loss - min(losses)) < chi2_isf(_UNLIKELY / len(grid), 1):
+    middle = _lowest_of(loss, grid, general.loss - chi2_isf(_UNLIKELY / len(grid), 1) / 2, 1e-3)
+    if middle is None:
         return None
-    middle = lowest(loss, _around_least(grid, losses), 1e-3)
     fit = at(middle)
-    misfit, freedom = fit.misfit()
-    if misfit > chi2_isf(_UNLIKELY, freedom):
+    if fit.unlike(_UNLIKELY):
         return None
 
     def end(sign: int) -> float:
@@ -733,9 +726,13 @@ def _high_pass(general: _Fit, threshold: float) -> Term | None:
     return Term(*np.exp([middle, end(-1), end(1)]).tolist())
 
 
-def _around_least(grid: FloatArray, losses: Sequence[float]) -> tuple[float, float]:
+def _lowest_of(loss: Callable[[float], float], grid: FloatArray, most: float, tolerance: float) -> float | None:
+    """Return where a loss is least, about the best of a grid; None where that is more than `most`."""
+    losses = list(map(loss, grid))
     best = int(np.argmin(losses))
-    return grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+    if losses[best] > most:
+        return None
+    return lowest(loss, (grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]), tolerance)
 
 
 def _warm_up(spectrum: _Spectrum, terms: str) -> WarmUp | None:
@@ -757,14 +754,12 @@ def _warm_up(spectrum: _Spectrum, terms: str) -> WarmUp | None:
     def loss(logarithm: float) -> float:
         return replace(without.model, extra=spectrum.decay(np.exp(logarithm))).fit().loss
 
-    losses = [loss(np.log(time)) for time in grid]
-    if 2 * (without.loss - min(losses)) < _OVERWHELMING:
+    if (best := _lowest_of(loss, np.log(grid), without.loss - _OVERWHELMING / 2, 1e-4)) is None:
         return None
-    time = float(np.exp(lowest(loss, _around_least(np.log(grid), losses), 1e-4)))
+    time = float(np.exp(best))
     fit = replace(without.model, extra=spectrum.decay(time)).fit()
-    misfit, freedom = fit.misfit()
-    if misfit > chi2_isf(_UNLIKELY, freedom):
-        excess = _excess(fit, freedom)
+    if fit.unlike(_UNLIKELY):
+        excess = _excess(fit)
         fit = replace(fit.model, excess=excess).fit()
         without = replace(without.model, excess=excess).fit()
         if 2 * (without.loss - fit.loss) < _OVERWHELMING:

@@ -74,7 +74,7 @@ class SpectralLine:
     @property
     def recorded(self) -> FloatArray:
         """The frequency (k,) as samples show it: from zero to half the rate."""
-        return np.abs((self.frequency + self.rate / 2) % self.rate - self.rate / 2)
+        return abs((self.frequency + self.rate / 2) % self.rate - self.rate / 2)
 
     @property
     def moves(self) -> bool:
@@ -91,7 +91,7 @@ class SpectralLine:
     @property
     def slow(self) -> bool:
         """Whether it comes so close to zero frequency that a window shows it as drift."""
-        return bool(self.folds(0.0).size or np.min(self.recorded) < _LOBE * self.resolution)
+        return bool(self.folds(0.0).size or self.recorded.min() < _LOBE * self.resolution)
 
     def folds(self, at: float) -> FloatArray:
         """Return times (c,), s, at which it passes a frequency, of the rate: zero, or a half."""
@@ -109,7 +109,7 @@ def windows_at_rest(time: FloatArray, rests: FloatArray, rate: float) -> tuple[I
     **Arguments:** `time` (n,): stamps, s; `rests` (r, 2): starts and stops, s; `rate`: Hz. Windows with gaps are left
     out.
     """
-    spans = np.searchsorted(time, rests)
+    spans = time.searchsorted(rests)
     width = int(min(np.median(np.diff(spans)) // 2, _LONGEST)) if len(spans) else 0
     width -= width % 16  # transforms of round lengths are quick
     if width < 4 * _SIDE:
@@ -119,7 +119,7 @@ def windows_at_rest(time: FloatArray, rests: FloatArray, rate: float) -> tuple[I
         for (first, last), count in zip(spans, np.diff(spans)[:, 0] // width, strict=True)
     ]
     first = np.concatenate(starts).astype(np.int64)
-    return first[np.abs((time[first + width - 1] - time[first]) * rate - (width - 1)) < 1], width
+    return first[abs((time[first + width - 1] - time[first]) * rate - (width - 1)) < 1], width
 
 
 def follow(parts: FloatArray, times: FloatArray, rate: float) -> list[SpectralLine]:
@@ -146,8 +146,8 @@ def _of_axis(parts: FloatArray, times: FloatArray, rate: float, axis: int) -> li
     """Follow one line after the other; what a line covers says nothing of the next."""
     (count, width), lobe = parts.shape, _LOBE * _OVER
     tapered, power, noise = spectra(parts)
-    total = np.sum(np.hanning(width + 1))
-    if not np.all(noise[:, lobe:] > 1e-20 * np.mean(parts**2)):
+    total = np.hanning(width + 1).sum()
+    if not (noise[:, lobe:] > 1e-20 * (parts**2).mean()).all():
         return []
     ordinates = power / noise
     points = _OVER * width
@@ -162,16 +162,15 @@ def _of_axis(parts: FloatArray, times: FloatArray, rate: float, axis: int) -> li
     while len(lines) < _MOST:
         odds = np.where(hidden, 0.0, odds)
         evidence = _forward(odds[:, :, fold], gaps)
-        whole = float(scipy.special.logsumexp(evidence) - np.log(evidence.size))
-        if whole < _ENOUGH:
+        if (whole := float(scipy.special.logsumexp(evidence) - np.log(evidence.size))) < _ENOUGH:
             break
-        strength, move = np.unravel_index(np.argmax(evidence), evidence.shape)
+        strength, move = np.unravel_index(evidence.argmax(), evidence.shape)
         beyond = np.where(hidden, 0.0, np.maximum(ordinates - _CAP, 0.0))  # of a strong line its middle counts most
         course = _likeliest((odds[strength] + np.log1p(beyond))[:, fold], gaps, *_MOVES[:, move])
         at = fold[course % points]
         visible = odds[strength, window, at] > 0
         frequency = course * rate / points
-        steady = np.where(np.abs(np.arange(odds.shape[2]) - at[:, None]) <= lobe, odds, 0.0).sum(axis=1).max()
+        steady = np.where(abs(np.arange(odds.shape[2]) - at[:, None]) <= lobe, odds, 0.0).sum(axis=1).max()
         size = _size(tapered / total, frequency, times, rate, noise[window, at] / total**2, visible)
         lines.append(SpectralLine(axis, times, frequency, visible, size, rate, rate / width, whole, float(steady)))
         hidden |= _covered(ordinates, at)
@@ -234,10 +233,10 @@ def _likeliest(odds: FloatArray, gaps: FloatArray, drift: float, walk: float) ->
         shift, spread = _OVER * drift * gap, _OVER * walk * np.sqrt(gap)
         step = round(shift) + np.arange(-int(4 * spread) - 1, int(4 * spread) + 2)
         reached = score[(np.arange(points) - step[:, None]) % points] - 0.5 * ((step - shift) / spread)[:, None] ** 2
-        best = np.argmax(reached, axis=0)
+        best = reached.argmax(axis=0)
         steps.append(step[best])
         score = gain + reached[best, np.arange(points)]
-    course = [int(np.argmax(score))]
+    course = [int(score.argmax())]
     for step in reversed(steps):
         course.append(course[-1] - int(step[course[-1] % points]))
     course = np.array(course[::-1])
@@ -255,9 +254,8 @@ def _covered(ordinates: FloatArray, at: NDArray[np.intp]) -> BoolArray:
     for sign in (-1, 1):
         end = _LOBE * _OVER
         while end < last:
-            near = ordinates[np.arange(count), np.clip(at + sign * (end + 1), 0, last - 1)]
-            above = np.exp(-np.sort(near)[-half])
-            if scipy.special.betainc(half, count - half + 1, above) > FALSE_LINE:
+            near = ordinates[np.arange(count), (at + sign * (end + 1)).clip(0, last - 1)]
+            if scipy.special.betainc(half, count - half + 1, np.exp(-np.sort(near)[-half])) > FALSE_LINE:
                 break
             end += 1
         ends.append(end)
@@ -276,7 +274,7 @@ def _size(
     """Return the amplitude of a line, its drift within the windows (k, w) undone, and noise taken off its power."""
     time = (np.arange(tapered.shape[1]) - (tapered.shape[1] - 1) / 2) / rate
     phase = 2 * np.pi * (frequency[:, None] * time + np.gradient(frequency, times)[:, None] * time**2 / 2)
-    return float(2 * root_or_zero(np.mean((np.abs(dot_rows(tapered, np.exp(-1j * phase))) ** 2 - noise)[visible])))
+    return float(2 * root_or_zero((abs(dot_rows(tapered, np.exp(-1j * phase))) ** 2 - noise)[visible].mean()))
 
 
 def swing(values: FloatArray, time: FloatArray, line: SpectralLine) -> tuple[float, float]:
@@ -290,7 +288,7 @@ def swing(values: FloatArray, time: FloatArray, line: SpectralLine) -> tuple[flo
     drift, middle = np.polyfit(centred, np.interp(time, line.times, line.frequency), 1)
     hidden = _LOBE * line.resolution
     half_range = _OFF / length
-    if np.abs(middle - line.rate * np.round(middle / line.rate)) < hidden:
+    if abs(middle - line.rate * np.round(middle / line.rate)) < hidden:
         half_range = max(half_range, hidden)
     offsets, bends = np.meshgrid(
         np.arange(-half_range, half_range, 1 / (8 * length)), np.linspace(-_OFF, _OFF, 2 * _LOBE * 4 + 1) / length**2
@@ -298,8 +296,8 @@ def swing(values: FloatArray, time: FloatArray, line: SpectralLine) -> tuple[flo
     turns = (middle + offsets.ravel()[:, None]) * centred + (drift + bends.ravel()[:, None]) * centred**2 / 2
     rows = np.stack([np.ones_like(turns), np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)], axis=1)
     level = values.mean()
-    noise = float(np.mean(np.diff(values) ** 2) / 2)
-    covariance = np.linalg.inv(rows @ rows.swapaxes(1, 2) / noise + np.diag([0.0, 2.0, 2.0]) / line.size**2)
+    noise = float((np.diff(values) ** 2).mean() / 2)
+    covariance = np.linalg.inv(rows @ rows.mT / noise + np.diag([0.0, 2.0, 2.0]) / line.size**2)
     score = rows @ (values - level) / noise
     estimate = np.einsum("gij,gj->gi", covariance, score)
     weight = np.einsum("gi,gi->g", estimate, score) / 2 + np.linalg.slogdet(covariance)[1] / 2

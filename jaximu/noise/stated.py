@@ -50,8 +50,7 @@ def sensor_noise(document: Mapping[str, Any], name: str) -> SensorNoise:
     """Return Q, N, B, K and repeatability of an `allan.json` as a dictionary called `name`; as `read_sensor_noise`."""
     figures = {}
     for triad, quantity in INERTIAL_QUANTITIES.items():
-        axes = document.get(triad)
-        if axes is None:
+        if (axes := document.get(triad)) is None:
             continue
         units = SI_UNITS[quantity]
         terms = {}
@@ -62,8 +61,7 @@ def sensor_noise(document: Mapping[str, Any], name: str) -> SensorNoise:
                     0.0 if entry is None else _in_si(entry, units[term], f"{name}: {triad} {term}") for entry in entries
                 ]
                 terms[term] = np.array(values, float).reshape(3)
-            spread = (document.get("repeatability") or {}).get(triad)
-            if spread is not None:
+            if (spread := (document.get("repeatability") or {}).get(triad)) is not None:
                 terms["repeatability"] = np.reshape(_in_si(spread, units["B"], f"{name}: {triad} repeatability"), 3)
         figures[triad] = {term: values for term, values in terms.items() if np.any(values)}
     return figures
