@@ -199,7 +199,7 @@ class Run(eqx.Module):
         """Return the samples (S, 6: rate, force), SI, as this model of the unit corrects them."""
         force, rate = imu.recover(*self.output, self.beside)
         assert rate is not None
-        return jnp.concatenate([rate, force], axis=-1)
+        return jnp.hstack([rate, force])
 
     def changed(self, change: Any) -> Imu:
         """Return the unit with its uncertain numbers changed by so much (p,)."""
@@ -208,8 +208,7 @@ class Run(eqx.Module):
 
     def corrected_by(self, imu: Imu, noise: Any = 0.0) -> Navigation:
         """Return where this model of the unit takes it to be; noise (S, 6): of rate and force, SI."""
-        samples = self.samples(imu) + noise
-        vectors = increments(samples[:, :3], samples[:, 3:], self.intervals)
+        vectors = increments(*jnp.hsplit(self.samples(imu) + noise, 2), intervals=self.intervals)
         return mechanise(self.start, *vectors, self.intervals, self.every)
 
     def error(self, reference: Navigation, change: Any, noise: Any = 0.0) -> Any:
@@ -253,22 +252,20 @@ def consequences(
     """
     require_float64()
     run = prepared(calibration, trajectory, files[0])
-    second = None if against is None else prepared(against, trajectory, files[1])
-    if second is not None:
+    if (second := None if against is None else prepared(against, trajectory, files[1])) is not None:
         for name, triad in run.imu.triads().items():
-            if triad.output_unit != second.imu.triads()[name].output_unit:
+            if triad.output_unit != second.imu.triad(name).output_unit:
                 raise InputError(f"{files[1]} gives the {name} in other units than {files[0]}: not of the same unit.")
     reference = _corrected(run, run.imu)
     slopes = np.asarray(_slopes(run, reference))
     kinds = [kind_of(name, run.imu) for name in run.names]
-    terms = {}
-    known = {}
+    terms, known = {}, {}
     for kind in dict.fromkeys(kinds):
         chosen = np.array([other == kind for other in kinds])
         terms[kind] = _variances(slopes[..., chosen], submatrix(run.covariance, chosen))
         known[kind] = _variances(slopes[..., ~chosen], _given(run.covariance, chosen))
     whole = _variances(slopes, run.covariance)
-    notes = [*trajectory.notes, *_notes(calibration, noise)]
+    notes = *trajectory.notes, *_notes(calibration, noise)
     terms |= _noise_terms(trajectory, noise or {})
     left_out = {
         name: lengths_of(np.asarray(_deviation(_corrected(run, model), reference))[:, :3])
@@ -291,7 +288,7 @@ def consequences(
         check,
         compared,
         apart,
-        tuple(notes),
+        notes,
     )
 
 

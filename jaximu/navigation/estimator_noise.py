@@ -42,6 +42,7 @@ from jaximu.ground.gravity import Gravity
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import number
+from jaximu.ground.rotation import rotations_of
 from jaximu.ground.stored import compiled
 from jaximu.ground.tracing import on_host
 from jaximu.ground.units import INERTIAL_QUANTITIES
@@ -109,7 +110,7 @@ class ModelledErrors:
     @property
     def duration(self) -> float:
         """Length of the motion, s."""
-        return float(np.sum(self.trajectory.intervals))
+        return float(self.trajectory.intervals.sum())
 
     @property
     def words(self) -> str:
@@ -249,8 +250,8 @@ class MeasuredErrors:
         whole = (stop - start < (step + 1.5) * period) & _without_gaps(self.since, self.until, start, stop)
         kept = _spread(np.flatnonzero(whole & self.steady[first] & self.steady[last]))
         first, last, start, stop = (ends[kept] for ends in (first, last, start, stop))
-        begin = np.searchsorted(self.until, start, "right")
-        size = max(1, int((np.searchsorted(self.since, stop) - begin).max(initial=1)))
+        begin = self.until.searchsorted(start, "right")
+        size = max(1, int((self.since.searchsorted(stop) - begin).max(initial=1)))
         places = begin[:, None] + np.arange(size)
         rows = np.minimum(places, len(self.until) - 1)
         held = np.minimum(self.until[rows], stop[:, None]) - np.maximum(self.since[rows], start[:, None])
@@ -261,13 +262,11 @@ class MeasuredErrors:
 
     def _errors(self, rates: FloatArray, forces: FloatArray, held: FloatArray, first: Any, last: Any) -> Any:
         """Return errors (n, 3, 6 or 9) of ΔR, Δv, Δp and of Δv with the reference's rotation (n, 3), or None."""
-        rotations = scipy.spatial.transform.Rotation
-        known = rotations.from_quat(self.rotation, scalar_first=True)
+        known = rotations_of(self.rotation)
         at_start = known[first]
         time = self.stamp[last] - self.stamp[first]
         integrated = _integrated(rates, forces, held)
-        turned = (at_start.inv() * known[last]).inv() * rotations.from_quat(integrated[0], scalar_first=True)
-        errors = [turned.as_rotvec()]
+        errors = [((at_start.inv() * known[last]).inv() * rotations_of(integrated[0])).as_rotvec()]
         if self.velocity is None:
             return errors[0], None
         up = np.array([0.0, 0.0, self.gravity])
@@ -277,11 +276,11 @@ class MeasuredErrors:
             away = self.position[last] - self.position[first] - self.velocity[first] * time[:, None]
             errors.append(np.asarray(integrated[2]) - at_start.inv().apply(away + up * time[:, None] ** 2 / 2))
         edges = self.stamp[first][:, None] + np.cumulative_sum(held, axis=1, include_initial=True)
-        edges = np.clip(edges, self.stamp[0], self.stamp[-1])
+        edges = edges.clip(self.stamp[0], self.stamp[-1])
         path = scipy.spatial.transform.Slerp(self.stamp, known)
         before, after = path(edges[:, :-1].ravel()), path(edges[:, 1:].ravel())
         turning = (before.inv() * after).as_rotvec().reshape(rates.shape) / np.where(held > 0, held, 1.0)[..., None]
-        return np.concatenate(errors, axis=1), np.asarray(_integrated(turning, forces, held)[1]) - gained
+        return np.hstack(errors), np.asarray(_integrated(turning, forces, held)[1]) - gained
 
 
 def steady_stamps(stamp: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> BoolArray:
@@ -316,7 +315,7 @@ def _covariances(samples: tuple, interval: Any, flicker: Mapping[str, Any], slop
         samples, slope, change = part
         reaction = preintegrate_samples(*samples).reaction
         white = jnp.einsum("sij,skj->jik", reaction, reaction) / interval
-        later = jnp.cumsum(reaction[::-1], axis=0)[::-1] - reaction  # a walk's step moves all samples after it
+        later = reaction[::-1].cumsum(axis=0)[::-1] - reaction  # a walk's step moves all samples after it
         walk = jnp.einsum("sij,skj->jik", later, later) * interval
         drift = {
             triad: noise_covariance(None, reaction[..., _COLUMNS[triad]], system)[1]
@@ -530,7 +529,7 @@ class _Length(NamedTuple):
 
 def _squared(root: FloatArray) -> FloatArray:
     """R Rᵀ (n, m, m) of roots R (n, m, p)."""
-    return root @ root.swapaxes(1, 2)
+    return root @ root.mT
 
 
 def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: float) -> _Length:
@@ -556,12 +555,11 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
     for triad, columns in _COLUMNS.items():
         sizes = noise[triad]
         spread[triad, "N"] = np.einsum("njik,j->nik", white[:, columns], np.square(sizes["N"]))
-        spread[triad, "white"] = np.sum(white[:, columns], axis=1) * rms(sizes["N"]) ** 2
-        spread[triad, "1"] = np.sum(walk[:, columns], axis=1)
+        spread[triad, "white"] = white[:, columns].sum(axis=1) * rms(sizes["N"]) ** 2
+        spread[triad, "1"] = walk[:, columns].sum(axis=1)
         if np.any(sizes.get("K", 0.0)):
             spread[triad, "K"] = np.einsum("njik,j->nik", walk[:, columns], np.square(sizes["K"]))
-    longest = max(length, source.duration / _BLOCKS)
-    block = (stretches.start / longest).astype(int)
+    block = (stretches.start / max(length, source.duration / _BLOCKS)).astype(int)
     if not modelled:
         return _measured_part(stretches, spread, block)
     power = source.trajectory.excess_power({triad: noise[triad]["N"] for triad in INERTIAL_QUANTITIES})
@@ -626,7 +624,7 @@ def _walk(part: _Length, triad: str) -> float:
 
 def _multiples(unit: FloatArray, moment: FloatArray) -> float:
     """Return the mean of tr(unit⁻¹ moment)/3: the square of how many times the one is the other."""
-    return float(np.mean(np.linalg.solve(unit, moment).trace(axis1=1, axis2=2)) / 3)
+    return float(np.linalg.solve(unit, moment).trace(axis1=1, axis2=2).mean() / 3)
 
 
 def _terms(part: _Length, triad: str) -> dict[str, float]:
@@ -642,8 +640,7 @@ def _multiplier(
     turned: the gyroscope's multiplier, in what the accelerometer's stands beside.
     """
     rows = _OWN[triad]
-    moment = part.moment[triad]
-    if moment is None:
+    if (moment := part.moment[triad]) is None:
         return None
     white = part.noise[triad, "white"][:, rows, rows]
     known = walks[triad] ** 2 * part.noise[triad, "1"][:, rows, rows]
@@ -651,7 +648,7 @@ def _multiplier(
     if triad == "accelerometer":
         beside = turned**2 * part.noise["gyroscope", "white"] + walks["gyroscope"] ** 2 * part.noise["gyroscope", "1"]
         root = None if part.root is None else part.root[:, rows]
-        known = known + beside[:, rows, rows]
+        known += beside[:, rows, rows]
         candidates.append(_with_interval(white, known, part.whole[:, rows, rows], root, part.block, draws, rng))
     return max(candidates)
 
@@ -667,9 +664,9 @@ def _with_interval(
 ) -> tuple[float, float, float]:
     """Return m and its interval for which the NEES of an error is one, where m² white + known is assumed of it."""
     inverse = np.linalg.inv(np.linalg.cholesky(white))
-    share, turn = np.linalg.eigh(inverse @ known @ inverse.swapaxes(1, 2))
+    share, turn = np.linalg.eigh(inverse @ known @ inverse.mT)
     share = np.maximum(share, 0.0)
-    basis = np.swapaxes(turn, 1, 2) @ inverse
+    basis = turn.mT @ inverse
     square = np.einsum("nai,nij,naj->na", basis, moment, basis, optimize=True)
     if root is None:
         value = float(np.sqrt(_solved(square, share)))

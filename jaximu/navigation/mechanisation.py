@@ -26,7 +26,18 @@ from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
 from jaximu.ground.gravity import EQUATOR_RADIUS, SQUARED_ECCENTRICITY, normal_gravity
-from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, product, rotation_rows
+from jaximu.ground.rotation import (
+    Numbers,
+    Quaternion,
+    Vector,
+    Vectors,
+    conjugate,
+    exponential,
+    logarithm,
+    multiply,
+    product,
+    rotation_rows,
+)
 from jaximu.ground.tracing import array_module
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.navigation.by_component import cross, matvec, right_jacobian, transpose, turn
@@ -42,12 +53,12 @@ class Navigation(NamedTuple):
     height: above the ellipsoid, m. anomaly: gravity at the start less normal gravity there, m/s².
     """
 
-    attitude: Float[Array, "... 4"]
-    velocity: Float[Array, "... 3"]
-    latitude: Float[Array, " ..."]
-    longitude: Float[Array, " ..."]
-    height: Float[Array, " ..."]
-    anomaly: Float[Array, " ..."]
+    attitude: Quaternion
+    velocity: Vector
+    latitude: Numbers
+    longitude: Numbers
+    height: Numbers
+    anomaly: Numbers
 
     @classmethod
     def at(cls, attitude, velocity, latitude: float, height: float, gravity: float) -> Navigation:
@@ -111,12 +122,12 @@ def _step(state: Navigation, sums: _Sums) -> Navigation:
     turning = [(a + b) * time for a, b in zip(earth, moving, strict=True)]
     pushed = _lagging(pushed, moving, time / 2)
     carried = _lagging(carried, turning, 1 / 3)
-    pushed[2] = pushed[2] - gravity * time
+    pushed[2] -= gravity * time
     middle = [v + d / 2 for v, d in zip(state.velocity, pushed, strict=True)]
     coriolis = cross([2 * a + b for a, b in zip(earth, moving, strict=True)], middle)
     after = [v + d - c * time for v, d, c in zip(state.velocity, pushed, coriolis, strict=True)]
     moved = [v * time + p - c * time**2 / 2 for v, p, c in zip(state.velocity, carried, coriolis, strict=True)]
-    moved[2] = moved[2] - gravity * time**2 / 2
+    moved[2] -= gravity * time**2 / 2
     w, x, y, z = product(state.attitude, sums.rotation)
     w, x, y, z = turn([w, -x, -y, -z], turning)  # exp(−ζ) ⊗ q = (q* ⊗ exp(ζ))*
     return Navigation(
@@ -130,7 +141,7 @@ def _step(state: Navigation, sums: _Sums) -> Navigation:
 
 
 def _parts(array: Array) -> list[Array]:
-    return [array[..., index] for index in range(array.shape[-1])]
+    return list(jnp.unstack(array, axis=-1))
 
 
 def _split(state: Navigation) -> Navigation:
@@ -143,8 +154,8 @@ def _joined(state: Navigation) -> Navigation:
 
 def mechanise(
     start: Navigation,
-    rotation: Float[Array, "... S 3"],
-    gained: Float[Array, "... S 3"],
+    rotation: Vectors,
+    gained: Vectors,
     intervals: Float[Array, " S"],
     every: int = 1,
 ) -> Navigation:

@@ -30,11 +30,11 @@ def noise_covariance(
         moved = identity if matrix is None else jnp.broadcast_to(matrix, identity.shape)
         push = push.T[:, :, None]
         across = push * system.output[:, None, :]
-        whole = jnp.block([[moved, across], [jnp.zeros_like(across).swapaxes(-1, -2), system.transition]])
-        drive = jnp.concatenate([push * system.through[:, None, :], system.drive], axis=1)
-        covariance = whole @ covariance @ whole.swapaxes(-1, -2) + drive @ drive.swapaxes(-1, -2)
+        whole = jnp.block([[moved, across], [jnp.zeros_like(across).mT, system.transition]])
+        drive = jnp.hstack([push * system.through[:, None, :], system.drive])
+        covariance = whole @ covariance @ whole.mT + drive @ drive.mT
         return covariance, jnp.diagonal(covariance.sum(axis=0))[:size]
 
     root = jnp.pad(jnp.asarray(system.root), ((0, 0), (size, 0), (0, 0)))
-    covariance, variances = jax.lax.scan(step, root @ root.swapaxes(-1, -2), (transition, reaction))
+    covariance, variances = jax.lax.scan(step, root @ root.mT, (transition, reaction))
     return variances, covariance.sum(axis=0)[:size, :size]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -16,13 +17,15 @@ import numpy as np
 
 from jaximu.calibration import Calibration, compensate
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import UP, conjugate, rotate
 from jaximu.ground.stored import compiled
 from jaximu.ground.tracing import part_of
-from jaximu.ground.vectors import lengths_of
+from jaximu.ground.units import INERTIAL_QUANTITIES
+from jaximu.ground.vectors import lengths_of, means_by_group, root_or_zero
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
 from jaximu.navigation import Navigation
 from jaximu.recordings.recording import Recording
@@ -78,15 +81,14 @@ class Trajectory:
         """
         require_float64()
         count = len(self.intervals)
-        total = float(np.sum(self.intervals))
+        total = float(self.intervals.sum())
         if count > _MOST:
             raise NotPossibleError(
                 f"the path has {count} samples, and {_MOST} are the most: shorten it with --duration "
                 f"{_MOST * total / count:.0f}."
             )
         apart = 10 * max(1, round(min(1.0, total / 20) * count / total / 10))  # tens are quick to mechanise
-        kept = count // apart * apart
-        if kept < 2 * apart:
+        if (kept := count // apart * apart) < 2 * apart:
             raise NotPossibleError(f"the path lasts only {total:.2g} s ({count} samples): give a longer one.")
         stimulus, intervals = part_of((self.stimulus, self.intervals), slice(kept))
         return replace(self, stimulus=stimulus, intervals=intervals, every=apart)
@@ -94,12 +96,12 @@ class Trajectory:
     @property
     def times(self) -> FloatArray:
         """The reported times (T,), s from the start."""
-        return np.cumsum(self.intervals)[self.every - 1 :: self.every].round(9)  # not 0.99…
+        return self.intervals.cumsum()[self.every - 1 :: self.every].round(9)  # not 0.99…
 
     @property
     def interval(self) -> float:
         """Mean interval of the samples, s."""
-        return float(np.mean(self.intervals))
+        return float(self.intervals.mean())
 
     def excess_power(self, density: Mapping[str, FloatArray]) -> dict[str, float]:
         """Return by triad how much more power the samples have at half their rate than white noise of a density N has.
@@ -111,10 +113,11 @@ class Trajectory:
         if not self.recorded or len(self.intervals) < 2 * _WINDOW:
             return {}
         weight = np.hanning(_WINDOW) * np.where(np.arange(_WINDOW) % 2 == 0, 1.0, -1.0)
-        known = (("gyroscope", self.stimulus.angular_rate), ("accelerometer", self.stimulus.specific_force))
         excess = {}
-        for triad, values in known:
-            whole = np.asarray(values)[: len(self.intervals) // _WINDOW * _WINDOW].reshape(-1, _WINDOW, 3)
+        for triad, quantity in INERTIAL_QUANTITIES.items():
+            whole = np.asarray(getattr(self.stimulus, quantity))[: len(self.intervals) // _WINDOW * _WINDOW].reshape(
+                -1, _WINDOW, 3
+            )
             measured = (np.einsum("k,nki->ni", weight, whole) ** 2).mean() / (weight**2).sum()
             white = np.square(density[triad]).mean() / self.interval
             excess[triad] = max(float(measured / white) - 1.0, 0.0)
@@ -123,15 +126,14 @@ class Trajectory:
     def require_range(self, limits: Mapping[str, float]) -> None:
         """Raise `NotPossibleError` where the path leaves a sensor's range, by triad in m/s² and rad/s."""
         for triad, limit in limits.items():
-            gyroscope = triad == "gyroscope"
-            felt = np.asarray(self.stimulus.angular_rate if gyroscope else self.stimulus.specific_force)
-            beyond = np.abs(felt) > limit
+            felt = np.asarray(getattr(self.stimulus, INERTIAL_QUANTITIES[triad]))
+            beyond = abs(felt) > limit
             if beyond.any():
                 row, axis = (int(index[0]) for index in beyond.nonzero())
-                factor, unit = (np.degrees(1.0), "°/s") if gyroscope else (1.0, "m/s²")
+                factor, unit = (np.degrees(1.0), "°/s") if triad == "gyroscope" else (1.0, "m/s²")
                 raise NotPossibleError(
                     f"the path leaves the {triad}'s range of ±{factor * limit:.4g} {unit}: {'xyz'[axis]} feels "
-                    f"{factor * felt[row, axis]:.4g} {unit} {np.sum(self.intervals[:row]):.2f} s after the start. Take "
+                    f"{factor * felt[row, axis]:.4g} {unit} {self.intervals[:row].sum():.2f} s after the start. Take "
                     "a gentler path or a sensor with more range."
                 )
 
@@ -166,11 +168,11 @@ def _felt_on_the_road(time, turns, earth, latitude, gravity):
     radius = 6371e3  # of the transport rate: what the path is, not how it is navigated
 
     def heading(time):
-        done = jnp.clip((time - turns) / _TURN_TIME, 0.0, 1.0)
-        return jnp.pi / 2 * (1 + jnp.sum(senses * smooth_course(done, 0.5)))  # from north, to the left and right
+        done = ((time - turns) / _TURN_TIME).clip(0.0, 1.0)
+        return jnp.pi / 2 * (1 + (senses * smooth_course(done, 0.5)).sum())  # from north, to the left and right
 
     def velocity(time):
-        speed = _SPEED * smooth_course(jnp.clip((time - _REST) / _RISE, 0.0, 1.0), 0.5)
+        speed = _SPEED * smooth_course(((time - _REST) / _RISE).clip(0.0, 1.0), 0.5)
         return speed * jnp.stack([jnp.cos(heading(time)), jnp.sin(heading(time)), 0.0])
 
     def felt(time):
@@ -202,16 +204,16 @@ def of_specification(
     environment = {"gravity": site.gravity.value} | stated | {"latitude": site.latitude}
     case = Specification(document | {"environment": environment}, specification.name).case(0)
     motion = case.plan.motion
-    whole = motion.stimulus(case.rate)
     longest = motion.samples(case.rate)
     count = longest if duration is None else min(longest, round(duration * case.rate))
-    stimulus = part_of(whole, slice(count))
+    stimulus = part_of(motion.stimulus(case.rate), slice(count))
     start = _start(motion.attitude[0], site, float(motion.gravity))
-    limits = {}
-    for artefact in case.artefacts:
-        for name in ("accelerometer", "gyroscope"):
-            if artefact.name == "clipping" and getattr(artefact, name) is not None:
-                limits[name] = float(getattr(artefact, name) / case.imu.triads()[name].scales.max())
+    limits = {
+        name: float(getattr(artefact, name) / case.imu.triad(name).scales.max())
+        for artefact in case.artefacts
+        for name in INERTIAL_QUANTITIES
+        if artefact.name == "clipping" and getattr(artefact, name) is not None
+    }
     words = f"the motion of {Path(specification.name).name}, {count / case.rate:g} s at {site.latitude:g}° latitude"
     return Trajectory(start, stimulus, np.full(count, 1 / case.rate), words).cut(), limits
 
@@ -227,12 +229,9 @@ def of_recording(recording: Recording, calibration: Calibration, site: Place, du
     if recording.gyroscope is None:
         raise NotPossibleError(f"{recording.name} has no gyroscope: record a motion with both sensors.")
     ready = compensate(calibration, recording)
-    gyroscope = ready.gyroscope
-    accelerometer = ready.accelerometer
-    assert gyroscope is not None
-    time = gyroscope.time
-    rate = gyroscope.values
-    force = accelerometer.at(time)
+    gyroscope = ready.signals["gyroscope"]
+    time, rate = gyroscope.time, gyroscope.values
+    force = ready.accelerometer.at(time)
     notes = []
     if recording.attitude is not None:
         first = float(recording.attitude.time[0])
@@ -240,12 +239,11 @@ def of_recording(recording: Recording, calibration: Calibration, site: Place, du
         gravity = site.gravity.value
         notes.append("the motion starts at the log's first attitude, and its velocity there is taken as zero.")
     else:
-        begin, end = _first_rest(time, force, rate, site.gravity.value, recording.name)
-        first = begin
-        resting = (time >= begin) & (time <= min(end, begin + _LEVELLED))
+        first, end = _first_rest(time, force, rate, site.gravity.value, recording.name)
+        resting = (time >= first) & (time <= min(end, first + _LEVELLED))
         up = force[resting].mean(axis=0)
         attitude = attitude_of(up).as_quat(scalar_first=True)
-        gravity = float(np.linalg.norm(up))
+        gravity = float(lengths_of(up))
         rate = rate - rate[resting].mean(axis=0) + attitude_of(up).inv().apply(earth_rate(np.radians(site.latitude)))
         notes.append(f"the motion starts at the log's first rest, {first:.1f} s in, levelled there; heading unknown.")
     kept = (time >= first) & (time < first + duration)
@@ -255,7 +253,7 @@ def of_recording(recording: Recording, calibration: Calibration, site: Place, du
     words = f"{min(duration, float(time[-1]) - first):.4g} s of the motion recorded in {Path(recording.name).name}"
     steps = np.diff(time[kept])
     bend = np.diff(steps[steps < 2.5 * np.median(steps)])  # of white jitter its variance is six times
-    jitter = float(np.sqrt((bend**2).mean() / 6)) if len(bend) else 0.0
+    jitter = float(rms(bend) / np.sqrt(6)) if len(bend) else 0.0
     start = _start(attitude, site, gravity)
     return Trajectory(start, stimulus, np.gradient(time)[kept], words, tuple(notes), True, jitter).cut()
 
@@ -264,24 +262,18 @@ def _first_rest(
     time: FloatArray, force: FloatArray, rate: FloatArray, gravity: float, where: str
 ) -> tuple[float, float]:
     """Begin and end (s) of the first rest: whole seconds in which corrected samples stay near gravity and no rate."""
-    second = np.floor(time - time[0]).astype(int)
-    count = np.maximum(np.bincount(second), 1)
-
-    def means(values: FloatArray) -> FloatArray:
-        return np.stack([np.bincount(second, column) for column in values.T], axis=1) / count[:, None]
-
-    force_mean = means(force)
-    rate_mean = means(rate)
+    means = partial(means_by_group, np.floor(time - time[0]).astype(int))
+    force_mean, rate_mean = means(force), means(rate)
     spread = np.stack([means(values**2) - mean**2 for values, mean in ((force, force_mean), (rate, rate_mean))])
-    still = np.sqrt(np.maximum(spread.sum(axis=-1), 0)) < np.array(_STILL)[:, None]
-    level = np.abs(lengths_of(force_mean) - gravity) < _STILL[0]
-    calm = still.all(axis=0) & level & (lengths_of(rate_mean) < _STILL[1])
+    still = root_or_zero(spread.sum(axis=-1)).T < _STILL
+    level = abs(lengths_of(force_mean) - gravity) < _STILL[0]
+    calm = still.all(axis=1) & level & (lengths_of(rate_mean) < _STILL[1])
     if not calm.any():
         quiet = int(spread.sum(axis=(0, 2)).argmin())
         raise NotPossibleError(
             f"{where} has neither a rest of a second to start from nor an attitude (attitude_w, …): hold the unit "
             "still before it moves, or log its attitude. In its quietest second the calibrated unit reads "
-            f"{np.linalg.norm(force_mean[quiet]):.2f} m/s² and {np.degrees(np.linalg.norm(rate_mean[quiet])):.2f} °/s; "
+            f"{lengths_of(force_mean[quiet]):.2f} m/s² and {np.degrees(lengths_of(rate_mean[quiet])):.2f} °/s; "
             "if it was at rest then, the calibration is not this unit's."
         )
     first = int(calm.argmax())
