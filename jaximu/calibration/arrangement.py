@@ -57,8 +57,7 @@ def unusual_gains(imu: Imu, weak: Sequence[WeakDirection], scales: Mapping[str, 
         arranged, rest = np.eye(3), rotation_of(read.T).T
     if not np.array_equal(arranged, np.eye(3)):
         findings.append(_axes(arranged))
-    angle = np.degrees(angle_of(rest))
-    if angle > np.degrees(_MOUNTED):
+    if (angle := np.degrees(angle_of(rest))) > np.degrees(_MOUNTED):
         axis = np.array([rest[2, 1] - rest[1, 2], rest[0, 2] - rest[2, 0], rest[1, 0] - rest[0, 1]])
         axis /= -max(float(np.linalg.norm(axis)), 1e-300)
         shown = ", ".join(f"{component:.2f}" for component in axis)
@@ -131,7 +130,7 @@ def _axes(arranged: FloatArray) -> Finding:
 
 def _described(matrix: FloatArray) -> str:
     """Say what a map of axes puts right."""
-    exchanged = [axis for axis, row in zip("xyz", np.abs(np.diag(matrix)), strict=True) if row == 0]
+    exchanged = [axis for axis, row in zip("xyz", abs(np.diag(matrix)), strict=True) if row == 0]
     negative = [axis for axis, row in zip("xyz", matrix.sum(axis=1), strict=True) if row < 0]
     parts = []
     if exchanged:
@@ -147,12 +146,11 @@ def _factors(name: str, scale: FloatArray, triad: Triad) -> list[Finding]:
     """Name scales that are a whole factor off the data sheet's, or off by more than sensors are."""
     sizes = triad.scales / scale
     logarithm = np.log(sizes)
-    usual, odd = float(np.exp(logarithm.mean())), np.abs(logarithm) > _ODD
+    usual, odd = float(np.exp(logarithm.mean())), abs(logarithm) > _ODD
     option = "--accel-scale" if name == "accelerometer" else "--gyro-scale"
     like = "another full-scale range" + (", or a sample rate that is as far off" if name == "gyroscope" else "")
-    whole = np.zeros(3)
-    for factor in _FACTORS:
-        whole[np.abs(np.log(sizes / factor)) < _NEAR] = factor
+    near = abs(np.log(np.divide.outer(sizes, _FACTORS))) < _NEAR
+    whole = (near * _FACTORS).max(axis=1)
 
     def of_range(sensor: str, size: float, text: str) -> Finding:
         return Finding("data.range", (), f"{sensor}: its gain is {size:.3g} times the nominal{text}")

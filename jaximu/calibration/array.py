@@ -30,9 +30,9 @@ from jaximu.ground.distributions import rms
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.precision import require_float64
-from jaximu.ground.rotation import right_jacobian
+from jaximu.ground.rotation import IDENTITY, right_jacobian, rotations_of
 from jaximu.ground.tracing import on_host
-from jaximu.ground.vectors import lengths_of, root_or_zero, sigmas_of
+from jaximu.ground.vectors import lengths_of, means_by_group, root_or_zero, sigmas_of
 from jaximu.mistakes import prepare
 from jaximu.model.mounting import Mounting
 from jaximu.model.noise_model import NoiseModel
@@ -108,9 +108,7 @@ def calibrate_array(
     ]
     scatter = _scatter([errors for _, errors in pairs])
     none = np.zeros(3)
-    itself = ArrayUnit(
-        recordings[0].name, calibrations[0], np.array([1.0, 0.0, 0.0, 0.0]), none, none, none, 0.0, 0.0, 0.0, (0.0, 0.0)
-    )
+    itself = ArrayUnit(recordings[0].name, calibrations[0], IDENTITY, none, none, none, 0.0, 0.0, 0.0, (0.0, 0.0))
     bare = itself, *(unit for unit, _ in pairs)
     units = tuple(
         replace(unit, rate_scatter=rate, force_scatter=force) for unit, (rate, force) in zip(bare, scatter, strict=True)
@@ -152,7 +150,7 @@ class _Shared:
         near = _NEAR / slowest
         measured = unseen.searchsorted(start - near) == unseen.searchsorted(start + length + near)
         start = start[~still & measured]
-        windows = np.stack([start, start + length], axis=1)
+        windows = np.column_stack([start, start + length])
         speed = lengths_of(means_over(gyroscopes[0], windows))
         windows, speed = windows[speed > _SLOW], speed[speed > _SLOW]
         if len(windows) < _FEWEST or len(rests) < 3:
@@ -161,7 +159,7 @@ class _Shared:
                 f"{len(windows) * length:.2g} s while all were recorded; an array needs three rests and ten seconds of "
                 "turns, quick ones about all axes."
             )
-        order = np.argsort(-speed)
+        order = (-speed).argsort()
         quick, others = order[: _WINDOWS // 2], np.sort(order[_WINDOWS // 2 :])
         evenly = others[:: max(1, -(-len(others) // (_WINDOWS // 2)))]
         return cls(first, rests, windows[np.sort(np.concatenate([quick, evenly]))])
@@ -215,10 +213,9 @@ def _rotation(shared: _Shared, corrected: Recording, delay: float) -> FloatArray
     """Return the matrix from a unit's axes to the first's that explains rates and gravity best."""
     force, rate = shared.means(corrected, delay)
     known_force, known_rate = shared.means(shared.first, 0.0)
-    weight = np.sum(rate**2) / np.sum(force**2)
+    weight = (rate**2).sum() / (force**2).sum()
     back = turning_best(known_rate.T @ rate + weight * known_force.T @ force)
-    left = ((known_rate - rate @ back.T) ** 2).sum() / (known_rate**2).sum()
-    if left > 1 - _ALIKE:
+    if (left := ((known_rate - rate @ back.T) ** 2).sum() / (known_rate**2).sum()) > 1 - _ALIKE:
         raise NotPossibleError(
             f"{corrected.name} does not turn as {shared.first.name} does: however the one is mounted on the other, "
             f"{100 * min(left, 1):.0f} % of the rotation is left. Were both recorded at the same time, on one body?"
@@ -251,7 +248,7 @@ def _prior(imu: Imu, calibration: Calibration, first: Calibration, back: FloatAr
     assert effects is not None
     blur = np.zeros((len(names), len(names)))
     for triad, model in imu.triads().items():
-        across = model.gain @ back.T @ np.linalg.inv(first.imu.triads()[triad].gain)
+        across = model.gain @ back.T @ np.linalg.inv(first.imu.triad(triad).gain)
         for part, matrix in (("gain", np.kron(across, back.T)), ("bias", across)):
             rows = [row for row, name in enumerate(names) if (name.owner, name.part) == (triad, part)]
             blur[np.ix_(rows, rows)] = -matrix
@@ -299,17 +296,14 @@ def _scatter(errors: Sequence[FloatArray]) -> list[tuple[float | None, float | N
     Of three units or more the variances of all differences are sums of two units' own (the three-cornered hat, Gray
     and Allan 1974), by least squares.
     """
-    count = len(errors) + 1
-    if count < 3:
+    if (count := len(errors) + 1) < 3:
         return [(None, None)] * count
     whole = [np.zeros_like(errors[0]), *errors]
     pairs = list(combinations(range(count), 2))
-    design = np.zeros((len(pairs), count))
-    for row, pair in zip(design, pairs, strict=True):
-        row[list(pair)] = 1.0
+    design = np.eye(count)[pairs].sum(axis=1)
     scatter = []
     for columns in (slice(3, 6), slice(3)):
-        variances = [np.mean((whole[i] - whole[j])[:, columns] ** 2) for i, j in pairs]
+        variances = [((whole[i] - whole[j])[:, columns] ** 2).mean() for i, j in pairs]
         scatter.append(root_or_zero(np.linalg.lstsq(design, np.array(variances), rcond=None)[0]).tolist())
     return list(zip(*scatter, strict=True))
 
@@ -324,11 +318,10 @@ def _averaged(shared: _Shared, corrected: Sequence[Recording], units: Sequence[A
         outputs = []
         for recording, unit in zip(corrected, units, strict=True):
             begin = start + unit.time_offset + later_zero(shared.first.start, recording.start)
-            values = means_over(recording.signals[name], np.stack([begin, begin + _BLOCK], axis=1))
-            values = Rotation.from_quat(unit.rotation, scalar_first=True).inv().apply(values)
-            means = np.stack([np.bincount(rest, axis) for axis in values.T], 1) / np.bincount(rest)[:, None]
-            outputs.append(values - means[rest])
-        variance = np.array([np.sum(values**2) / freedom for values in outputs])
+            values = means_over(recording.signals[name], np.column_stack([begin, begin + _BLOCK]))
+            values = rotations_of(unit.rotation).inv().apply(values)
+            outputs.append(values - means_by_group(rest, values)[rest])
+        variance = np.array([(values**2).sum() / freedom for values in outputs])
         mean = np.einsum("u,uik->ik", (1 / variance) / (1 / variance).sum(), np.array(outputs))
         averaged.append(
             (

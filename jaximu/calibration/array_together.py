@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import equinox as eqx
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from jaximu.calibration.array_units import Array
 from jaximu.calibration.hand_held import fit_hand_held
@@ -21,6 +20,7 @@ from jaximu.data.poses import EXCESS_NAMES
 from jaximu.estimation.fitting import Fit, fit
 from jaximu.estimation.problem import Name, without_equipment
 from jaximu.ground.precision import require_float64
+from jaximu.ground.rotation import rotations_of
 from jaximu.ground.tracing import part_of, stacked
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.sensor import Board, Imu
@@ -71,7 +71,7 @@ def fit_together(found: Array, left_out: Sequence[int] = ()) -> Together:
     mask[:, list(left_out)] = False
     observations = eqx.tree_at(lambda tree: tree.turns.mask, observations, mask)
     alone = fit_hand_held(stacked([unit.calibration.imu.with_effects() for unit in found.units]), observations)
-    back = Rotation.from_quat([unit.rotation for unit in found.units], scalar_first=True).inv()
+    back = rotations_of([unit.rotation for unit in found.units]).inv()
     turned = [
         unit.with_effects(SetupReferenceRotation.make(vector))
         for unit, vector in zip(_units(alone), back.as_rotvec(), strict=True)
@@ -113,9 +113,9 @@ def _most_in_common(alone: Fit, observations: Observations) -> float:
 
     A few turns would else do without a maximum of the likelihood: the gains that all units share run after this size.
     """
-    back = np.linalg.inv(alone.imu.triads()["gyroscope"].gain)
-    noise = (back @ observations.turns.noise @ back.swapaxes(1, 2)).trace(axis1=1, axis2=2)
-    return float(np.max(alone.excess[:, EXCESS_NAMES.index("turns")] * noise) / noise[0])
+    back = np.linalg.inv(alone.imu.triad("gyroscope").gain)
+    noise = (back @ observations.turns.noise @ back.mT).trace(axis1=1, axis2=2)
+    return float((alone.excess[:, EXCESS_NAMES.index("turns")] * noise).max() / noise[0])
 
 
 def _free(name: Name) -> bool:

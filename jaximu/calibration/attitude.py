@@ -25,6 +25,7 @@ from jaximu.ground.differences import interpolated, midpoints
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
+from jaximu.ground.rotation import UP
 from jaximu.ground.tracing import on_host
 from jaximu.ground.vectors import column_lengths, dot_rows, lengths_of, sigmas_of, submatrix
 from jaximu.mistakes import Prepared, prepared
@@ -203,10 +204,9 @@ def _of_shape(calibration: Calibration, measurement: AgainstAttitude) -> FloatAr
     what a first-order lag of that variance has.
     """
     data, imu = measurement.intervals, calibration.imu
-    matrix = np.asarray(imu.triads()["gyroscope"].inverse())
+    matrix = np.asarray(imu.triad("gyroscope").inverse())
     rate, slope = data.rate @ matrix[:, :3].T + matrix[:, 3], data.slope @ matrix[:, :3].T
-    spread = abs(float(Mounting.of(imu).filter_variance))
-    delay = spread**1.5 / 3 * (slope**2).sum() / (rate**2).sum()
+    delay = abs(float(Mounting.of(imu).filter_variance)) ** 1.5 / 3 * (slope**2).sum() / (rate**2).sum()
     effects = imu.all_effects()
     delayed = [isinstance(effects.get(name.key), SetupReferenceDelay) for name in calibration.names]
     return delay**2 * np.diag(delayed)
@@ -280,28 +280,28 @@ def _coarse(recording: Recording, attitude: Attitude) -> _Start:
             f"{attitude.name} lies from {attitude.time[0]:.6g} to {attitude.time[-1]:.6g} s and {name} from "
             f"{span[0]:.6g} to {span[1]:.6g} s: they do not overlap. Put both on one clock, or let both begin at zero."
         )
-    rate = np.sqrt(np.nanmean((lengths_of(attitude.turned()) / np.diff(attitude.time)) ** 2))
+    speeds = lengths_of(attitude.turned()) / np.diff(attitude.time)
+    rate, good = np.sqrt(np.nanmean(speeds**2)), ~np.isnan(speeds)
     if rate < _LEAST:
         raise NotPossibleError(f"{attitude.name} hardly turns ({np.degrees(rate):.2g} °/s, rms): {_RECORD}")
-    delays = _delays(recording, attitude)
-    delay, plain = delays[0], _matched(recording, attitude, delays[0])
-    for other in delays[1:]:  # turns at regular times, as a robot makes them, look alike but for their axes
+    delay, *others = delays_of_speeds(gyroscope, midpoints(attitude.time)[good], speeds[good], attitude.period)
+    plain = _matched(recording, attitude, delay)
+    for other in others:  # turns at regular times, as a robot makes them, look alike but for their axes
         if plain.score > _CLEAR:
             break
         match = _matched(recording, attitude, other)
         delay, plain = (other, match) if match.score > plain.score + 0.02 else (delay, plain)
     if plain.score > _CLEAR:
         return plain
-    q = attitude.quaternion
-    others = {
+    q, last = attitude.quaternion, attitude.quaternion[:, _LAST]
+    readings = {
         "": q,
         "its quaternions run from the upright frame to the body and were taken so": q * _BACK,
-        "its quaternions have w last and were taken so": q[:, _LAST],
-        "its quaternions have w last and run from the upright frame to the body, and were taken so": q[:, _LAST]
-        * _BACK,
+        "its quaternions have w last and were taken so": last,
+        "its quaternions have w last and run from the upright frame to the body, and were taken so": last * _BACK,
     }
     best = plain
-    for text, values in others.items():
+    for text, values in readings.items():
         notes = attitude.notes + ((f"{attitude.name}: {text}.",) if text else ())
         changed = replace(attitude, quaternion=values, notes=notes).usable()
         for reading in (changed, _turned_up(changed)):
@@ -326,7 +326,7 @@ def _coarse(recording: Recording, attitude: Attitude) -> _Start:
 def _turned_up(attitude: Attitude) -> Attitude:
     """Return a reference whose frame's z points down (north, east, down) with x, −y, −z for its axes."""
     w, x, y, z = attitude.quaternion.T
-    turned = replace(attitude, quaternion=np.stack([-x, w, -z, y], axis=1))
+    turned = replace(attitude, quaternion=np.column_stack([-x, w, -z, y]))
     return _mirrored(
         turned, np.array([1.0, -1.0, -1.0]), "its frame's z points down; its axes were taken as x, −y, −z."
     )
@@ -346,8 +346,7 @@ def _right_handed(recording: Recording, start: _Start) -> Attitude:
     axis of that has the opposite sign.
     """
     attitude = start.attitude
-    velocity = attitude.velocities()
-    if velocity is None:
+    if (velocity := attitude.velocities()) is None:
         return attitude
     rows = np.arange(0, len(attitude.time), max(1, round(0.5 / attitude.period)))
     inside = attitude.time[rows] - start.delay
@@ -359,7 +358,7 @@ def _right_handed(recording: Recording, start: _Start) -> Attitude:
     felt = stood.apply(parts).reshape(len(inner), -1, 3).sum(axis=1)
     gained = np.diff(velocity[rows], axis=0)
     felt, gained = (vectors - vectors.mean(axis=0) for vectors in (felt, gained))
-    alike = np.sum(felt * gained, axis=0) / np.maximum(column_lengths(felt) * column_lengths(gained), 1e-300)
+    alike = (felt * gained).sum(axis=0) / np.maximum(column_lengths(felt) * column_lengths(gained), 1e-300)
     signs = np.where(alike < -max(_AGAINST, _CHANCE / np.sqrt(len(inner))), -1.0, 1.0)
     if (signs > 0).all():
         return attitude
@@ -391,11 +390,10 @@ def _same_unit(recording: Recording, start: _Start, imu: Imu) -> list[str]:
         (np.diff(values, 2, axis=0)[: count * _BLOCK].reshape(count, -1) ** 2).mean(axis=1)
         for values in (unit, unit - reference @ turned)
     )
-    still = np.argsort(moved)[: max(_FEWEST // 2, count // 10)]
+    still = moved.argsort()[: max(_FEWEST // 2, count // 10)]
     powers = (samples[: quiet * _LONGER].reshape(quiet, -1) ** 2).mean(axis=1)
     white = np.quantile(powers, 0.1) / (20 * gyroscope.rate)  # density; a third difference has 20 times the variance
-    ratio = float(np.mean(apart[still]) / (6 * white / np.median(np.diff(time))))
-    if ratio > _CLOSER:
+    if (ratio := float(apart[still].mean() / (6 * white / np.median(np.diff(time))))) > _CLOSER:
         return []
     return [
         f"{start.attitude.name} follows the noise of the gyroscope itself ({100 * np.sqrt(ratio):.2g} % of it is left "
@@ -421,13 +419,6 @@ def _rates(recording: Recording, attitude: Attitude, delay: float) -> tuple[Floa
     return unit[good], turned[good], midpoints(stamps)[good]
 
 
-def _delays(recording: Recording, attitude: Attitude) -> list[float]:
-    """Return by how much (s) the reference's stamps may be late, likeliest first, from the sizes of both rates."""
-    turned = lengths_of(attitude.turned()) / np.diff(attitude.time)
-    good, middle = ~np.isnan(turned), midpoints(attitude.time)
-    return delays_of_speeds(recording.signals["gyroscope"], middle[good], turned[good], attitude.period)
-
-
 def delays_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray, period: float) -> list[float]:
     """Return by how much (s) the stamps of another's angular speed (n,), rad/s, are late against a gyroscope's.
 
@@ -441,7 +432,7 @@ def delays_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray, 
     count = max(1, round(step * gyroscope.rate))
     unit = np.interp(grid, gyroscope.time, np.convolve(size, np.ones(count) / count, "same"), 0.0, 0.0)
     shifted = np.interp(grid, stamps, speeds, 0.0, 0.0)
-    inside = [(grid >= a) & (grid <= b) for a, b in ((gyroscope.time[0], gyroscope.time[-1]), (stamps[0], stamps[-1]))]
+    inside = [(grid >= time[0]) & (grid <= time[-1]) for time in (gyroscope.time, stamps)]
     a, b = (
         np.where(here, values - values[here].mean(), 0.0) for values, here in zip((unit, shifted), inside, strict=True)
     )
@@ -454,11 +445,11 @@ def delays_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray, 
     enough = together > 0.3 * min(here.sum() for here in inside)
     score = np.where(enough, against(a, b) / np.sqrt(np.maximum(power, 1e-30)), -1.0)
     lags = (np.arange(len(score)) - (len(grid) - 1)) * step
-    near = np.where(np.abs(lags) <= _NEAR, score, -1.0)
+    near = np.where(abs(lags) <= _NEAR, score, -1.0)
     chosen = near if near.max() > 0.7 * score.max() else score
     peaks, _ = scipy.signal.find_peaks(chosen, _NEARLY * chosen.max(), distance=max(1, round(_SEPARATE / step)))
-    best = int(np.argmax(chosen))
-    beside = sorted(peaks[np.abs(peaks - best) * step > _SEPARATE], key=lambda peak: -chosen[peak])
+    best = int(chosen.argmax())
+    beside = sorted(peaks[abs(peaks - best) * step > _SEPARATE], key=lambda peak: -chosen[peak])
     return [float(lags[lag]) for lag in (best, *beside[:_DELAYS])]
 
 
@@ -467,11 +458,10 @@ def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
     step = max(attitude.period, 1 / recording.accelerometer.rate) / 2
     best: _Start | None = None
     for shift in np.arange(-4, 4.5) * step:
-        common = _in_common(recording, attitude, delay + shift)
-        if common is None:
+        if (common := _in_common(recording, attitude, delay + shift)) is None:
             continue
         turning, rotating, force, up = common
-        weight = np.sum(turning**2) / np.sum(force**2)
+        weight = (turning**2).sum() / (force**2).sum()
         matrix = turning_best(turning.T @ rotating + weight * STANDARD.value * (force.T @ up))
         explained = 1 - ((turning - rotating @ matrix.T) ** 2).sum() / (turning**2).sum()
         upright = dot_rows(force, up @ matrix.T).mean() / lengths_of(force).mean()
@@ -493,7 +483,7 @@ def _in_common(recording: Recording, attitude: Attitude, delay: float) -> tuple[
     if len(unit) < 16:
         return None
     force = interpolated(recording.accelerometer.time, _smooth(recording), time)
-    up = attitude.at(time + delay).inv().apply([0.0, 0.0, 1.0])
+    up = attitude.at(time + delay).inv().apply(UP)
     return unit - unit.mean(axis=0), reference - reference.mean(axis=0), force, up
 
 
@@ -504,12 +494,11 @@ def _rearranged(recording: Recording, attitude: Attitude, delay: float) -> _Star
     reference's.
     """
     gyroscope = recording.signals["gyroscope"]
-    common = _in_common(recording, attitude, delay)
-    if common is None:
+    if (common := _in_common(recording, attitude, delay)) is None:
         return None
     turning, rotating, force, up = common
     read = np.linalg.lstsq(rotating, turning, rcond=None)[0].T
-    if np.sum((turning - rotating @ read.T) ** 2) > (1 - _CLEAR) * np.sum(turning**2):
+    if ((turning - rotating @ read.T) ** 2).sum() > (1 - _CLEAR) * (turning**2).sum():
         return None
     mounting = turning_best(force.T @ up)
     arranged = signed_permutation((read @ mounting.T).T).T

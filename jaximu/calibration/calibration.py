@@ -12,6 +12,7 @@ import numpy as np
 from jaximu.estimation.fitting import Fit, Prior
 from jaximu.estimation.problem import TOLERANCE, Name, flatten, names_of, typical_sizes, without_equipment
 from jaximu.estimation.projection import OutputUncertainty, output_uncertainty
+from jaximu.estimation.rows import Sizes
 from jaximu.estimation.uncertainty import (
     WeakDirection,
     describe,
@@ -119,8 +120,26 @@ class Calibration(Result, Document, page="calibration"):
 
     @property
     def parameters(self) -> ParameterTable:
-        """The fitted parameters by name, with value, standard deviation and unit, in the order of `covariance`."""
-        return _parameters_of(self)
+        """The fitted parameters by name, with value, standard deviation and unit, in the order of `covariance`.
+
+        In output units.
+        """
+        weak = {name for direction in self.weak for name, _ in direction.parameters}
+        triads, effects = self.imu.triads(), self.imu.all_effects()
+
+        def parameter(name: Name, sigma: float) -> Parameter:
+            output = "" if name.owner == "setup" else triads[name.owner].output_unit
+            if name.effect is not None:
+                effect = effects[name.key]
+                value = effect.coefficients[name.axes] if name.part == "coefficients" else getattr(effect, name.part)
+                unit = effect.coefficient_unit(output) if name.part == "coefficients" else effect.inner[name.part].unit
+            else:
+                value, si = getattr(triads[name.owner], name.part)[name.axes], SENSOR_UNITS[name.owner]
+                unit = output if name.part == "bias" else "1" if output == si else f"{output} per {unit_text(si)}"
+            determined = name not in self.open_numbers
+            return Parameter(str(name), describe(name, self.imu), float(value), sigma, unit, name in weak, determined)
+
+        return ParameterTable(list(map(parameter, self.names, sigmas_of(self.covariance).tolist())))
 
     def triads(self) -> dict[str, Triad]:
         """Return the calibrated triads by name; a gyroscope or a magnetometer may have been calibrated by itself."""
@@ -236,11 +255,8 @@ class Calibration(Result, Document, page="calibration"):
 
     def covariance_of(self, names: Sequence[Name]) -> FloatArray:
         """Return the covariance (k, k) of some numbers, zero where fixed by convention or not calibrated."""
-        there = [index for index, name in enumerate(names) if name in self.names]
-        rows = [self.names.index(names[index]) for index in there]
-        whole = np.zeros((len(names), len(names)))
-        whole[np.ix_(there, there)] = submatrix(self.covariance, rows)
-        return whole
+        rows = [self.names.index(name) if name in self.names else -1 for name in names]  # the last is zero
+        return submatrix(np.pad(self.covariance, (0, 1)), rows)
 
     def gravity_shift(self) -> FloatArray:
         """Return what one sigma of gravity's error, K ∝ 1/g, adds to the numbers (p,); zeros where C lacks it."""
@@ -249,9 +265,8 @@ class Calibration(Result, Document, page="calibration"):
         shift = np.where(scaled, [values[name] for name in self.names], 0.0) * self.gravity.sigma / self.gravity.value
         scale = np.sqrt(np.maximum(np.diagonal(self.covariance), shift**2))
         scale = np.where(scale > 0, scale, 1.0)
-        rest = (self.covariance - np.outer(shift, shift)) / scale[:, None] / scale
-        held = np.linalg.eigvalsh(rest).min(initial=0.0) > -_ROUNDING  # C − s sᵀ is a covariance
-        return shift if held else np.zeros(len(shift))
+        rest = (self.covariance - np.outer(shift, shift)) / np.outer(scale, scale)
+        return shift * (np.linalg.eigvalsh(rest).min(initial=0.0) > -_ROUNDING)  # else C − s sᵀ is no covariance
 
     def _effects(self, owner: str, model: Triad) -> Json:
         """Return the effects of a triad as the JSON document has them."""
@@ -332,7 +347,7 @@ def concluded(
     method: str,
     loss: str,
     excess_names: Sequence[str],
-    rms: Sequence[Mapping[str, tuple[float, str]]],
+    rms: Sequence[Sizes],
     notes: Sequence[str],
     advice: Callable[..., str] = pose_advice,
     known: Collection[Name] = (),
@@ -415,8 +430,7 @@ def provenance(recordings: Sequence[Recording]) -> Json:
 def require_another(calibration: Calibration, sources: Iterable[str]) -> None:
     """Raise `NotPossibleError` where a calibration was fitted to one of the files of these SHA-256."""
     fitted = {file.get("sha256"): file["file"] for file in calibration.data.get("files", ())}
-    same = [fitted[source] for source in sources if source and source in fitted]
-    if same:
+    if same := [fitted[source] for source in sources if source and source in fitted]:
         raise NotPossibleError(
             f"{same[0]} is the recording that this calibration was fitted to: it agrees with it whatever has moved "
             "since. Record the unit again, and check by that."
@@ -504,6 +518,8 @@ def _from_document(document: Json) -> Calibration:
     names = tuple(known[name] for name in document["covariance"]["parameters"])
     covariance = _numbers(document["covariance"]["matrix"], (len(names), len(names)))
     sigmas = dict(zip(names, sigmas_of(covariance), strict=True))
+    kept: Json = {name: fit[name] for name in ("method", "loss", "rank", "solver")}
+    kept |= {name: document.get(name) for name in ("diagnosis", "reference", "trace", "digest", "filter")}
 
     def recorded(name: str) -> FloatArray:
         entries = enumerate(document[name]["bias_sigma_recording"])
@@ -514,10 +530,8 @@ def _from_document(document: Json) -> Calibration:
         names=names,
         covariance=covariance,
         gravity=LocalGravity(gravity["value"], gravity["sigma"], gravity.get("latitude")),
-        method=fit["method"],
-        loss=fit["loss"],
+        **kept,
         rms={name: (entry["before"], entry["after"], entry["unit"]) for name, entry in fit["rms"].items()},
-        rank=fit["rank"],
         weak=tuple(
             WeakDirection(
                 entry["sigma"],
@@ -528,15 +542,9 @@ def _from_document(document: Json) -> Calibration:
             for entry in fit["weak_directions"]
         ),
         excess=fit["excess_variance"],
-        solver=fit["solver"],
         data=document["data"],
         notes=tuple(fit["notes"]),
         software=document["software"],
-        diagnosis=document.get("diagnosis"),
-        reference=document.get("reference"),
-        trace=document.get("trace"),
-        digest=document.get("digest"),
-        filter=document.get("filter"),
         absent=() if "accelerometer" in triads else ("accelerometer",),
         reading=None if document.get("reading") is None else Reading.from_document(document["reading"]),
         bias_sigma_recording={name: recorded(name) for name in triads if "bias_sigma_recording" in document[name]},
@@ -570,31 +578,3 @@ def _triad_of(part: Json, name: str) -> Triad:
         temperature_reference=float(part["temperature_reference"]),
         time_reference=float(part["time_reference"]),
     )
-
-
-def _parameters_of(calibration: Calibration) -> ParameterTable:
-    """Return the free parameters in the order of the covariance, in output units."""
-    model, weak = calibration.imu, {name for direction in calibration.weak for name, _ in direction.parameters}
-    triads, effects = model.triads(), model.all_effects()
-
-    def parameter(name: Name, sigma: float) -> Parameter:
-        output = "" if name.owner == "setup" else triads[name.owner].output_unit
-        if name.effect is not None:
-            effect = effects[name.key]
-            value = effect.coefficients[name.axes] if name.part == "coefficients" else getattr(effect, name.part)
-            unit = effect.coefficient_unit(output) if name.part == "coefficients" else effect.inner[name.part].unit
-        else:
-            value, si = getattr(triads[name.owner], name.part)[name.axes], SENSOR_UNITS[name.owner]
-            unit = output if name.part == "bias" else "1" if output == si else f"{output} per {unit_text(si)}"
-        return Parameter(
-            str(name),
-            describe(name, model),
-            float(value),
-            sigma,
-            unit,
-            name in weak,
-            name not in calibration.open_numbers,
-        )
-
-    sigmas = sigmas_of(calibration.covariance).tolist()
-    return ParameterTable([parameter(*entry) for entry in zip(calibration.names, sigmas, strict=True)])

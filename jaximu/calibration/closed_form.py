@@ -8,9 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import ArrayLike, Float
 
 from jaximu.ground.array_types import Array
-from jaximu.ground.rotation import Matrix, Vector
+from jaximu.ground.rotation import Matrix, Vector, Vectors
 
-Rows = Float[Array, "... S 3"]
 Number = Float[ArrayLike, "..."]
 
 
@@ -21,7 +20,7 @@ def six_position(up: Matrix, down: Matrix, gravity: Number) -> tuple[Matrix, Vec
 
     **Arguments:** `up`, `down`: mean outputs, row i with axis i up (down); `gravity`: m/s².
     """
-    gain = jnp.swapaxes(up - down, -1, -2) / (2 * jnp.asarray(gravity)[..., None, None])
+    gain = (up - down).mT / (2 * jnp.asarray(gravity)[..., None, None])
     return gain, jnp.mean(up + down, axis=-2) / 2
 
 
@@ -44,11 +43,11 @@ def turn_pairs(
     difference = anticlockwise - clockwise
     if durations is not None and bias is not None:
         difference = difference - (durations[..., 0] - durations[..., 1])[..., None] * bias[..., None, :]
-    return jnp.swapaxes(difference, -1, -2) / (2 * jnp.asarray(angle)[..., None, None])
+    return difference.mT / (2 * jnp.asarray(angle)[..., None, None])
 
 
 def linear_least_squares(
-    inputs: Rows, outputs: Rows, weights: Float[Array, "... S"] | None = None
+    inputs: Vectors, outputs: Vectors, weights: Float[Array, "... S"] | None = None
 ) -> tuple[Matrix, Vector]:
     """Return gain and bias of a triad, twelve numbers, from known inputs by QR (S8b): Y = (U 1) (K b)ᵀ.
 
@@ -113,14 +112,13 @@ def ferraris(
     **Returns:** `accelerometer_gain`, `accelerometer_bias`, `gyroscope_gain`, `gyroscope_bias`, and `cross` (3, 3), the
     gyroscope's output per m/s².
     """
-    flip = lambda rows: jnp.swapaxes(rows, -1, -2)  # noqa: E731
     twice = 2 * jnp.asarray(gravity)[..., None, None]
-    gain, bias = flip(up - down) / twice, jnp.diagonal(up + down, axis1=-2, axis2=-1) / 2
-    cross = flip(rest_up - rest_down) / twice
+    gain, bias = (up - down).mT / twice, jnp.diagonal(up + down, axis1=-2, axis2=-1) / 2
+    cross = (rest_up - rest_down).mT / twice
     still = jnp.mean(rest_up + rest_down, axis=-2) / 2 if rest is None else rest
-    moved = flip(turned_force) - bias[..., :, None] * durations[..., None, :]
+    moved = turned_force.mT - bias[..., :, None] * durations[..., None, :]
     force = jnp.linalg.solve(gain, moved)  # integrated, m/s
-    turning = flip(turned) - cross @ force - still[..., :, None] * durations[..., None, :]
+    turning = turned.mT - cross @ force - still[..., :, None] * durations[..., None, :]
     return {
         "accelerometer_gain": gain,
         "accelerometer_bias": bias,
@@ -130,7 +128,7 @@ def ferraris(
     }
 
 
-def remove_curvature(inputs: Rows, outputs: Rows, order: int = 2) -> tuple[Rows, Float[Array, "... 3 C"]]:
+def remove_curvature(inputs: Vectors, outputs: Vectors, order: int = 2) -> tuple[Vectors, Float[Array, "... 3 C"]]:
     """Return outputs without the curvature of each axis in its own input, and the coefficients of u², u³ … (S7).
 
     "Linearise first": each axis's output is fitted by a polynomial in its own input alone, and all above the straight
@@ -142,10 +140,10 @@ def remove_curvature(inputs: Rows, outputs: Rows, order: int = 2) -> tuple[Rows,
 
     **Arguments:** `inputs`: mean inputs of the stations, SI; `outputs`: mean outputs; `order`: 2 or 3.
     """
-    scale = jnp.max(jnp.abs(inputs), axis=-2, keepdims=True)
+    scale = jnp.max(abs(inputs), axis=-2, keepdims=True)
     powers = jnp.stack([(inputs / scale) ** power for power in range(order + 1)], axis=-1)  # (..., S, 3, order + 1)
     basis, upper = jnp.linalg.qr(jnp.swapaxes(powers, -3, -2))
-    right = jnp.sum(basis * jnp.swapaxes(outputs, -1, -2)[..., None], axis=-2)
+    right = jnp.sum(basis * outputs.mT[..., None], axis=-2)
     curved = jnp.linalg.solve(upper, right[..., None])[..., 0][..., 2:]
     curvature = jnp.sum(powers[..., 2:] * curved[..., None, :, :], axis=-1)
     return outputs - curvature, curved / scale[..., 0, :, None] ** jnp.arange(2, order + 1)

@@ -10,10 +10,11 @@ import numpy as np
 
 from jaximu.calibration.arrangement import axes_unlike
 from jaximu.calibration.calibration import Calibration, require_calibration
-from jaximu.estimation.track import TEMPERATURE_WINDOW
+from jaximu.estimation.track import TEMPERATURE_WINDOW, TRIADS
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
+from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model.sensor import Imu, Triad
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.recording import Recording, Signal, recordings_of, smoothed_slope
@@ -22,9 +23,7 @@ from jaximu.recordings.thermometer import course
 _BEYOND = 0.5  # K outside the calibrated range from which a bias is extrapolated
 
 
-@eqx.filter_jit
-def _recover(imu: Imu, accelerometer, gyroscope, stimulus: Stimulus):
-    return imu.recover(accelerometer, gyroscope, stimulus)
+_recover = eqx.filter_jit(Imu.recover)
 
 
 def compensate(calibration: Calibration, recording: Recording) -> Recording:
@@ -43,7 +42,7 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
     (recording,) = recordings_of([recording])
     imu = calibration.imu.transferable()
     known = calibration.triads()
-    signals = {name: recording.signals[name] for name in ("accelerometer", "gyroscope") if name in recording.signals}
+    signals = {name: recording.signals[name] for name in TRIADS if name in recording.signals}
     if "accelerometer" not in known:  # a gyroscope or a magnetometer alone: the rest stays as it is
         signals = {name: signal for name, signal in signals.items() if name in known}
     elif "accelerometer" not in signals:
@@ -58,8 +57,7 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
     results: dict[bytes, tuple] = {}  # sensors that share their stamps are recovered at once
     for name, signal in signals.items():
         time = signal.time
-        key = time.tobytes()
-        if key not in results:
+        if (key := time.tobytes()) not in results:
             outputs = {other: signal.at(time) for other, signal in signals.items()}
             stimulus = Stimulus(time=time)
             if recording.temperature is not None:
@@ -68,8 +66,8 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
                 stimulus = replace(stimulus, temperature=temperature, temperature_rate=slope)
             force = outputs["accelerometer"] if "accelerometer" in outputs else np.zeros((len(time), 3))
             results[key] = _recover(imu, force, outputs.get("gyroscope"), stimulus)
-        value = np.asarray(results[key][("accelerometer", "gyroscope").index(name)])
-        changed[name] = Signal(time, value, "m/s^2" if name == "accelerometer" else "rad/s")
+        value = np.asarray(results[key][TRIADS.index(name)])
+        changed[name] = Signal(time, value, SENSOR_UNITS[name])
     if imu.magnetometer is not None and recording.magnetometer is not None:
         rate = changed.get("gyroscope", recording.gyroscope)
         calibration.triad_of("magnetometer", recording)
@@ -106,7 +104,7 @@ def _extrapolated(calibration: Calibration, recording: Recording) -> list[str]:
     if covered is None or signal is None:
         return []
     low, high = covered
-    share = float(np.mean((signal.values < low - _BEYOND) | (signal.values > high + _BEYOND)))
+    share = float(((signal.values < low - _BEYOND) | (signal.values > high + _BEYOND)).mean())
     if not share:
         return []
     spanned = f"{signal.values.min():.1f} to {signal.values.max():.1f} °C"

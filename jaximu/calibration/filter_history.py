@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import BoolArray, FloatArray
 
@@ -35,4 +33,4 @@ class History:
         sigma = self.sigmas[:, place]
         if sigma[-1] > sigma[0] / 2:
             return None
-        return float(self.time[np.argmax(sigma <= 2 * sigma[-1])] - self.time[0])
+        return float(self.time[(sigma <= 2 * sigma[-1]).argmax()] - self.time[0])

@@ -65,8 +65,7 @@ def known_misalignments(nominal: Imu, free: Sequence[Name]) -> Prior:
     across = tuple(
         name for name in free if name.owner == "accelerometer" and name.part == "gain" and len({*name.axes}) > 1
     )
-    scale = nominal.accelerometer.scales
-    sigma = _ACROSS * np.array([scale[name.axes[0]] for name in across])
+    sigma = _ACROSS * nominal.accelerometer.scales[[name.axes[0] for name in across]]
     return Prior(across, np.zeros(len(across)), np.diag(1 / sigma))
 
 
@@ -94,7 +93,7 @@ def _second_step(first: Fit, observations: Observations, method: str, loss: str)
     second = fit(first.imu, turning, loss=loss)
 
     def beside(one: Array, other: Array) -> Array:
-        return np.concatenate([one, other], axis=1)
+        return np.hstack([one, other])
 
     fields = "sizes", "values", "magnitude_sensitivity", "residual"
     excess = beside(first.excess[:, :1], second.excess[:, 1:])
@@ -118,7 +117,7 @@ def _two_step_covariance(model: Imu, observations: Observations, excess: Array) 
     parameters = Parameters.select(like, without_equipment)
     first = sum(name.owner == "accelerometer" for name in parameters.names)
     count = len(excess)
-    reference = np.concatenate([np.reshape(leaf, (count, -1)) for leaf in jax.tree.leaves(model)], axis=1)
+    reference = np.hstack([np.reshape(leaf, (count, -1)) for leaf in jax.tree.leaves(model)])
 
     def batch(like, parameters, units):
         def lane(unit):
@@ -136,10 +135,8 @@ def _two_step_covariance(model: Imu, observations: Observations, excess: Array) 
                 known = jnp.eye(jacobian.shape[1]) / TOLERANCE**2
                 return -jnp.linalg.solve(jacobian.T @ jacobian + known, jacobian.T @ weights)
 
-            accelerometer, gyroscope = slice(None, first), slice(first, None)
-            one = step("norm", accelerometer)
-            two = step("turning", gyroscope)
-            both = jnp.concatenate([one, two + two @ slope[:, accelerometer] @ one])
+            one, two = step("norm", slice(first)), step("turning", slice(first, None))
+            both = jnp.concatenate([one, two + two @ slope[:, :first] @ one])
             return both @ (covariance.used[:, None] * covariance.used * covariance.dense().total(excess)) @ both.T
 
         return jax.lax.map(lane, units)
@@ -147,4 +144,4 @@ def _two_step_covariance(model: Imu, observations: Observations, excess: Array) 
     units = (reference, observations, excess)
     size = np.asarray(parameters.size)
     covariance = stored.call(batch, "two-step covariance", like, parameters, units, quick=count == 1)
-    return covariance * size[:, None] * size
+    return covariance * np.outer(size, size)

@@ -13,6 +13,7 @@ from jaximu.data.rest_blocks import Leg, RestBlocks
 from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
+from jaximu.ground.vectors import column_lengths
 
 _TOLD = 0.05
 """Share of a shape that smooth functions of temperature must leave of it."""
@@ -62,10 +63,10 @@ def separated(shapes: ThermalShapes) -> dict[str, Separation]:
     """
     blocks = shapes.blocks
     root = np.sqrt(blocks.stop - blocks.start)[:, None]
-    levels, drift = np.eye(blocks.levels)[blocks.level], np.eye(int(blocks.log.max()) + 1)[blocks.log]
-    drift = drift * (blocks.start / np.abs(blocks.stop).max())[:, None]
+    levels = blocks.of_level
+    drift = np.eye(int(blocks.log.max()) + 1)[blocks.log] * (blocks.start / abs(blocks.stop).max())[:, None]
     mean = orthonormal(root * levels)
-    base = orthonormal(root * np.concatenate([levels, drift, shapes.smooth()], axis=1))
+    base = orthonormal(root * np.hstack([levels, drift, shapes.smooth()]))
     grids: dict[str, list[ThermalTerm]] = {name: [ThermalTerm(name)] for name in RATES}
     grids |= {name: [history(name, value) for value in values] for name, values in shapes.grids.items()}
     columns = {name: [root[:, 0] * shapes.column(term)[0] for term in grid] for name, grid in grids.items()}
@@ -75,9 +76,9 @@ def separated(shapes: ThermalShapes) -> dict[str, Separation]:
         # a rate counts from standing still, a lag and a play, like temperature, from wherever they are
         whole = [_length(option if name in RATES else off(mean, option)) for option in options]
         alone = max(_length(off(base, option)) / size for option, size in zip(options, whole, strict=True))
-        others = np.stack([off(base, column) for other, column in middle.items() if other != name], axis=1)
+        others = np.column_stack([off(base, column) for other, column in middle.items() if other != name])
         # what rounding leaves of a shape is no shape
-        others = others[:, np.linalg.norm(others, axis=0) > 1e-9 * max(map(_length, middle.values()))]
+        others = others[:, column_lengths(others) > 1e-9 * max(map(_length, middle.values()))]
         left = _length(off(orthonormal(others), off(base, middle[name])))
         separations[name] = Separation(alone, left / whole[len(options) // 2], left**2)
     return separations
@@ -94,7 +95,7 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
     observable = [*POWERS, LEARNED, *(name for name, part in parts.items() if part.alone > _TOLD)]
     if len(legs) > _LISTED:
         low, high = blocks.range
-        fast = 60 * float(np.abs(blocks.rate).max())
+        fast = 60 * float(abs(blocks.rate).max())
         span = f"{low:.0f} and {high:.0f} °C".replace("-", "−")
         words = [f"The temperature went {len(legs)} ways up and down between {span}, at up to {fast:.2g} K/min."]
     else:
@@ -122,8 +123,7 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
         words.append(" ".join(sentences))
     else:
         words.append("This path of temperature separates every rate term, a lag and a hysteresis.")
-    levels = np.eye(blocks.levels)[blocks.level]
-    base, mean = orthonormal(np.concatenate([levels, shapes.smooth()], axis=1)), orthonormal(levels)
+    base, mean = orthonormal(np.hstack([blocks.of_level, shapes.smooth()])), orthonormal(blocks.of_level)
     scale = max(_length(off(base, column)) / _length(off(mean, column)) for column in shapes.column(ThermalTerm(SCALE)))
     if scale > _TOLD and blocks.several_poses:
         observable.append(SCALE)

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from jaximu.calibration.attitude import Mounted, mounted_on
@@ -33,7 +32,6 @@ from jaximu.data.motion import (
     carried,
     first_knowledge,
     interval_rows,
-    turned,
 )
 from jaximu.data.sightings import AttitudeSeen, FieldSeen, Sighting, VelocitySeen
 from jaximu.estimation.information_filter import Knowledge, WhiteRows, advance, estimate
@@ -45,7 +43,8 @@ from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.precision import require_float64
-from jaximu.ground.rotation import rotate
+from jaximu.ground.rotation import IDENTITY, rotate
+from jaximu.ground.tracing import on_host
 from jaximu.ground.vectors import sigmas_of
 from jaximu.mistakes import Prepared, prepared
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
@@ -69,7 +68,7 @@ this probability and they are so many times as large, squared: real noise is nev
 _SPAN = 1.5
 """Intervals that a padded interval holds, for uneven stamps."""
 
-_NOTHING = 0.0, 0.0, np.array([1.0, 0.0, 0.0, 0.0]), None
+_NOTHING = 0.0, 0.0, IDENTITY, None
 """What a reference says where it says nothing."""
 
 
@@ -133,7 +132,7 @@ class FilterInUse:
         calibration = calibration.inertial()
         if "gyroscope" not in calibration.triads():
             raise InputError("following a unit in use needs a calibrated gyroscope, and this calibration has none.")
-        gravity = calibration.gravity if gravity is None else gravity
+        gravity = gravity or calibration.gravity
         self.gravity = self._gravity = float(gravity.value)
         kept = list(calibration.imu.transferable().all_effects().values())
         for effect in kept:
@@ -144,9 +143,7 @@ class FilterInUse:
                 )
         outside = () if mounted is None else mounted.effects
         outside = (*outside, SetupMagneticField.dormant()) if magnetic else outside
-        self.imu: Imu = jax.tree.map(
-            np.asarray, calibration.imu.with_effects(*kept, GyroEarthRotation.dormant(), *outside)
-        )
+        self.imu: Imu = on_host(calibration.imu.with_effects(*kept, GyroEarthRotation.dormant(), *outside))
         known = calibration.of_numbers(lambda name: name.effect is None)
         beside = {
             key: EARTH_RATE if isinstance(effect, GyroEarthRotation) else effect.known
@@ -155,13 +152,14 @@ class FilterInUse:
         }
         free = Parameters.select(self.imu, lambda name: name in known.names or name.key in beside)
         self.names, self._index = free.names, np.asarray(free.index, int)
-        spread = [0.0 if name in known.names else beside[name.key] for name in free.names]
-        covariance = np.pad(known.covariance_of(free.names), (0, 1)) + np.diag(np.square([*spread, 0.0]))
-        for row, name in enumerate(free.names):
-            if name.part == "bias":
-                scale = np.linalg.norm(self.imu.triads()[name.owner].gain[name.axes[0]])
-                covariance[row, row] += (changing.get(name.owner, 0.0) * scale) ** 2
-        covariance[-1, -1] = max(gravity.sigma, 1e-6) ** 2
+        spread = [
+            changing.get(name.owner, 0.0) * np.linalg.norm(self.imu.triad(name.owner).gain[name.axes[0]])
+            if name.part == "bias"
+            else beside.get(name.key, 0.0)
+            for name in free.names
+        ]
+        spread.append(max(gravity.sigma, 1e-6))
+        covariance = np.pad(known.covariance_of(free.names), (0, 1)) + np.diag(np.array(spread) ** 2)
         self.prior = np.linalg.inv(np.linalg.cholesky(covariance))
         self.errors: Disturbances = seen_from_outside(disturbances(noise, known_scale(calibration)), mounted)
         self._mounted, self._magnetic = mounted, magnetic
@@ -172,7 +170,7 @@ class FilterInUse:
         self._numbers = flatten(self.imu)
         self.begun = self._numbers[self._index]
         self._known: Knowledge | None = None
-        self._path = MotionPath(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))
+        self._path = MotionPath(IDENTITY, np.zeros(3))
         self._waiting: list[_Sample] = []
         self._last: float | None = None
         self._quiet, self._resting, self._mean, self._moving, self._unseen = False, False, np.zeros(6), 0.0, 0.0
@@ -360,8 +358,7 @@ class FilterInUse:
         moved = change.copy()
         moved[6:states] = 0.0  # drift is no part of the path
         self._known = known._replace(right=known.right - known.root @ moved)
-        attitude = np.asarray(turned(after.attitude, change[:3]))
-        self._path = MotionPath(attitude, after.velocity + change[3:6])
+        self._path = on_host(after.moved(change[:6]))
         self._numbers = self._numbers.copy()
         self._numbers[self._index] += change[states:-1]
         self.gravity += float(change[-1])
@@ -372,7 +369,9 @@ class FilterInUse:
             self._recent.append((innovation, freedom))
         sigmas = sigmas_of(covariance)[states:-1]
         numbers = self._numbers[self._index]
-        return [FilterState(end, rest, numbers, sigmas, innovation, freedom, attitude, drift, sigmas_of(spread))]
+        return [
+            FilterState(end, rest, numbers, sigmas, innovation, freedom, self._path.attitude, drift, sigmas_of(spread))
+        ]
 
     @property
     def change(self) -> FloatArray:

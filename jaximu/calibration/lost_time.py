@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from jaximu.calibration.calibration import Calibration
@@ -91,7 +92,7 @@ class _Turned:
 
     def at(self, covariance: FloatArray) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         """Return NᵀPN and NᵀPr where the turns scatter by `covariance` (T, 2, 2), by Woodbury's identity."""
-        inner = np.eye(len(self.pull)) + self.gram @ _diagonal(covariance)
+        inner = np.eye(len(self.pull)) + self.gram @ scipy.linalg.block_diag(*covariance)
         return np.linalg.solve(inner, self.gram), np.linalg.solve(inner, self.pull)
 
     def deviations(self, variance: float, gone: Sequence[int]) -> tuple[FloatArray, FloatArray]:
@@ -159,23 +160,15 @@ class _Turned:
         evidence = np.zeros((len(_SCATTER), len(_SAMPLING)))
         for (k, scatter), (m, sampling) in product(enumerate(_SCATTER), enumerate(_SAMPLING)):
             covariance = scatter**2 * self.scatter + sampling**2 * self.sampling + share * self.lost
-            whole = _diagonal(covariance)
+            whole = scipy.linalg.block_diag(*covariance)
             inner = np.eye(len(self.pull)) + self.gram @ whole
             evidence[k, m] = (self.pull @ whole @ np.linalg.solve(inner, self.pull) - np.linalg.slogdet(inner)[1]) / 2
-        scatter = np.square(np.log(_SCATTER / _USUAL_SCATTER) / _SCATTER_SPREAD)
-        sampling = np.square(np.log(np.maximum(_SAMPLING, 0.02) / _USUAL_SAMPLING) / _SAMPLING_SPREAD)
+        scatter = (np.log(_SCATTER / _USUAL_SCATTER) / _SCATTER_SPREAD) ** 2
+        sampling = (np.log(np.maximum(_SAMPLING, 0.02) / _USUAL_SAMPLING) / _SAMPLING_SPREAD) ** 2
         beforehand = -np.add.outer(scatter, sampling) / 2
         evidence += beforehand - np.logaddexp.reduce(beforehand, axis=None)
         likeliest = int(evidence.argmax()) // len(_SAMPLING)
         return self.constant + float(np.logaddexp.reduce(evidence, axis=None)), float(_SCATTER[likeliest] ** 2)
-
-
-def _diagonal(blocks: FloatArray) -> FloatArray:
-    """Return the matrix (2T, 2T) with blocks (T, 2, 2) along its diagonal."""
-    count = len(blocks)
-    whole = np.zeros((count, 2, count, 2))
-    whole[np.arange(count), :, np.arange(count), :] = blocks
-    return whole.reshape(2 * count, 2 * count)
 
 
 class _Recorded:
@@ -183,7 +176,7 @@ class _Recorded:
 
     def __init__(self, calibration: Calibration) -> None:
         fitted, observations = calibration.fit, calibration.observations
-        gyroscope = calibration.imu.triads()["gyroscope"]
+        gyroscope = calibration.imu.triad("gyroscope")
         assert fitted is not None and observations is not None
         self.calibration, self.observations, self.gyroscope = calibration, observations, gyroscope
         self.signals = [part.recording.signals["gyroscope"] for part in calibration.segmentations]
@@ -204,7 +197,7 @@ class _Recorded:
         self.projector = inverse - weighted @ np.linalg.pinv(slope.T @ weighted, 1e-12, hermitian=True) @ weighted.T
         real = np.flatnonzero(self.turns.mask)
         start = len(observations.poses.mask) + 2 * real[:, None]
-        rows = self.rows = (np.cumsum(self.used) - 1)[start + np.arange(2)]
+        rows = self.rows = (self.used.cumsum() - 1)[start + np.arange(2)]
         # (T, S, 2): what a sample that is lost takes off its turn
         self.lacking = -np.einsum(
             "tasi,tsi->tsa",
@@ -222,7 +215,7 @@ class _Recorded:
         )
         self.excess = float(excess[1])
         self.samples = [self._samples(int(turn)) for turn in real]
-        self.counts = np.sum(self.interval[real] > 0, axis=1)
+        self.counts = (self.interval[real] > 0).sum(axis=1)
 
     def _samples(self, turn: int) -> tuple[int, int, int]:
         """Return the recording of a turn, its first sample in it and the one after its last."""
@@ -230,14 +223,14 @@ class _Recorded:
         part = int(counts.searchsorted(turn, "right"))
         poses = self.observations.poses
         ends = [poses.stop[turn], poses.start[turn + 1]]
-        first, last = np.searchsorted(self.signals[part].time, ends)
+        first, last = self.signals[part].time.searchsorted(ends)
         return part, int(first), int(last)
 
     def span(self, turn: int) -> str:
         """Return when a turn, by place, begins and ends."""
         part, first, last = self.samples[turn]
-        time = self.signals[part].time
-        return f"{time[first]:.1f} to {time[last - 1]:.1f} s"
+        begin, end = self.signals[part].time[[first, last - 1]]
+        return f"{begin:.1f} to {end:.1f} s"
 
     def jumps(self) -> list[FloatArray]:
         """Return for each turn (S − 1,) by how many times its usual step the course of the rate jumps in an interval.
@@ -257,7 +250,7 @@ class _Recorded:
         jumps = []
         for part, start, stop in self.samples:
             beside = np.arange(start, stop - 1)[:, None] + np.array([-3, -2, 2, 3])
-            around = np.mean(bends[part][beside.clip(0, len(bends[part]) - 1)] ** 2, axis=1)
+            around = (bends[part][beside.clip(0, len(bends[part]) - 1)] ** 2).mean(axis=1)
             jumps.append(bends[part][start : stop - 1] / np.sqrt(around + (_LEAST_JUMP * usual) ** 2 + 1e-30))
         return jumps
 
@@ -281,10 +274,8 @@ class _Recorded:
         speed = np.maximum(lengths_of(middle), 1e-9)
         axis = middle / speed[:, None]
         moved = wanted - carried
-        left = np.abs(dot_rows(moved, axis)) / np.maximum(lengths_of(moved), 1e-12)
-        carried, wanted = (
-            gravity - axis * (gravity * axis).sum(axis=1, keepdims=True) for gravity in (carried, wanted)
-        )
+        left = abs(dot_rows(moved, axis)) / np.maximum(lengths_of(moved), 1e-12)
+        carried, wanted = (gravity - axis * dot_rows(gravity, axis)[:, None] for gravity in (carried, wanted))
         angle = -np.arctan2(dot_rows(axis, np.cross(carried, wanted)), dot_rows(carried, wanted))
         return angle / speed, left
 
@@ -313,7 +304,7 @@ def without_lost_stretches(calibration: Calibration) -> tuple[list[Recording], l
         squared[gone] = 0.0
         if squared.max() < _OUT:
             break
-        gone.append(int(np.argmax(squared)))
+        gone.append(int(squared.argmax()))
     if not gone:
         return recordings, []
     off, squared = turned.deviations(turned.usual(gone), gone)
@@ -363,7 +354,7 @@ def _left_out(
         stamps = recorded.signals[part].time
         losses.append(
             f"between {stamps[first]:.1f} and {stamps[last - 1]:.1f} s gravity turned by "
-            f"{np.degrees(np.linalg.norm(off[turn])):.2g}° more than the gyroscope says, as if about {time:.2g} s were "
+            f"{np.degrees(lengths_of(off[turn])):.2g}° more than the gyroscope says, as if about {time:.2g} s were "
             f"missing at {stamps[first + interval]:.2f} s, where the rate jumps"
         )
         spots.append(first + interval + 2)
@@ -411,7 +402,7 @@ def lost_share(calibration: Calibration) -> list[Finding]:
         return []
     # samples lost everywhere show without the turns that are off most, which may be off for another reason
     squared = turned.deviations(turned.usual([]), [])[1]
-    others = turned.without(np.argsort(squared)[-_WORST:])
+    others = turned.without(squared.argsort()[-_WORST:])
     if others.evidence(share)[0] - others.evidence(0.0)[0] < _ALSO:
         return []
     if _effects(recorded) > turned.evidence(0.0)[0] + gain - _SHOWN:
@@ -440,8 +431,7 @@ def lost_share(calibration: Calibration) -> list[Finding]:
 
 def _gain(turned: _Turned) -> tuple[float, float]:
     """Return the likeliest share of samples lost, and by how many nats losses beat none, averaged over the shares."""
-    without = turned.evidence(0.0)[0]
-    gains = np.array([turned.evidence(share)[0] for share in _SHARES]) - without
+    gains = np.array([turned.evidence(share)[0] for share in _SHARES]) - turned.evidence(0.0)[0]
     return float(_SHARES[gains.argmax()]), float(np.logaddexp.reduce(gains) - np.log(len(gains)))
 
 

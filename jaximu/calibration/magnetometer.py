@@ -243,7 +243,7 @@ def _calibrated(
         )
     require_determined(fit, where)
     window = np.arange(len(windows))
-    rows = window if windows.alone else np.concatenate([window, np.repeat(window, 2), window])
+    rows = windows.placed(window, window, window)
     wider = allowing_for_neighbours(fit.covariance, fit.sizes, fit.residual, fit.jacobian, rows)
     if wider is not None:
         fit = replace(fit, covariance=wider)
@@ -291,8 +291,7 @@ def _calibrated(
         "disturbed": whole.time[~windows.used].tolist(),
     }
     if (error := magnetic["heading_error"]) is not None and open_heading(error):
-        advice = _CALIBRATED if base is None else ""
-        text = _OPEN_HEADING.format(error["rms"], error["before"]["rms"], advice)
+        text = _OPEN_HEADING.format(error["rms"], error["before"]["rms"], _CALIBRATED if base is None else "")
         calibration = replace(calibration, notes=(*calibration.notes, text))
     calibration = replace(calibration, covariance=fit.total_covariance(field.sigma), magnetic=magnetic)
     return _with_base(calibration, base), measurement, heading
@@ -305,8 +304,7 @@ def _base(
     logs: Sequence[MagneticLog], base: Calibration | None, gravity: LocalGravity
 ) -> tuple[Calibration | None, list[str]]:
     """Return the calibration of accelerometer and gyroscope: given, or of the logs' own poses, or None."""
-    recordings = [log.recording for log in logs if log.recording is not None]
-    if not recordings:
+    if not (recordings := [log.recording for log in logs if log.recording is not None]):
         return base, []
     calibration, findings, whose = base, [], "the calibration that was given"
     try:
@@ -330,12 +328,9 @@ def _uncertain_force(base: Calibration | None) -> FloatArray:
     known = base.of_numbers(lambda name: name.owner == "accelerometer" and name.effect is None)
     changes = np.zeros((len(known.names), 3, 4))  # of the gain and, over gravity, of the bias
     for change, name in zip(changes, known.names, strict=True):
-        if name.part == "gain":
-            change[name.axes] = 1.0
-        else:
-            change[name.axes[0], 3] = 1 / base.gravity.value
+        change[(*name.axes, 3)[:2]] = 1.0 if name.part == "gain" else 1 / base.gravity.value
     bent = -np.linalg.inv(base.imu.accelerometer.gain) @ changes
-    bent = np.concatenate([bent[:, :, :3].reshape(-1, 9), bent[:, :, 3]], axis=1)
+    bent = np.hstack([bent[:, :, :3].reshape(-1, 9), bent[:, :, 3]])
     return bent.T @ known.covariance @ bent
 
 
@@ -350,7 +345,7 @@ def _uncertain_turns(unit: Imu, base: Calibration | None) -> FloatArray:
     errors = np.zeros((len(values), 3, 3))
     for name, row in zip(known.names, vectors * root_or_zero(values), strict=True):
         errors[:, *name.axes] = row
-    return np.linalg.inv(unit.triads()["gyroscope"].gain) @ errors
+    return np.linalg.inv(unit.triad("gyroscope").gain) @ errors
 
 
 def _wrong_turns(
@@ -415,7 +410,7 @@ def _corrected(recording: Recording | None, unit: Imu, base: Calibration | None)
     if base is not None:
         return compensate(base, recording)
     changed: dict[str, Any] = {
-        name: Signal(signal.time, unit.triads()[name].recover_on_host(signal.values), SENSOR_UNITS[name])
+        name: Signal(signal.time, unit.triad(name).recover_on_host(signal.values), SENSOR_UNITS[name])
         for name, signal in recording.signals.items()
         if name in unit.triads()
     }
@@ -428,9 +423,9 @@ def ellipsoid(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
     The algebraic fit that most tools use: it weighs errors by their place and is biased by noise. None where the points
     lie on no ellipsoid.
     """
-    centre, size = values.mean(axis=0), float(np.std(values))
+    centre, size = values.mean(axis=0), float(values.std())
     x, y, z = ((values - centre) / size).T
-    design = np.stack([x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z, 2 * x, 2 * y, 2 * z], axis=1)
+    design = np.column_stack([x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z, 2 * x, 2 * y, 2 * z])
     p = np.linalg.lstsq(design, np.ones(len(design)), rcond=None)[0]
     shape = p[np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])]
     if np.linalg.cond(shape) > 1e6:
@@ -522,7 +517,7 @@ def _refuse_size(radius: float, strength: FieldStrength | None, where: str) -> N
 def _plausible(shape: tuple[FloatArray, FloatArray], output: FloatArray) -> bool:
     """Whether an ellipsoid is one that points determine: not far off, nor of a flat set, nor much longer one way."""
     lengths = np.linalg.eigvalsh(shape[0])
-    radius = 1 / np.cbrt(np.prod(lengths))
+    radius = 1 / np.cbrt(lengths.prod())
     thickness = np.sqrt(12 * np.linalg.eigvalsh(np.cov(output.T))[0])  # of points spread evenly
     wide = np.ptp(output, axis=0).max() > 0.8 * radius and thickness > _FLAT * radius
     return bool(lengths.max() < 3 * lengths.min() and wide)
@@ -536,8 +531,8 @@ def _carried_centre(windows: FieldWindows) -> tuple[FloatArray, float]:
     rows = np.flatnonzero(windows.turn)
     turned = windows.carried[rows]
     target = windows.output[rows] - np.einsum("nij,nj->ni", turned, windows.output[rows + 1])
-    centre, _, _, sizes = np.linalg.lstsq((np.eye(3) - turned).reshape(-1, 3), target.reshape(-1), rcond=1e-6)
-    return centre, float(_SHEET_GAIN * np.linalg.norm(windows.angle[rows]) / max(sizes[-1], 1e-12))
+    centre, _, _, sizes = np.linalg.lstsq((np.eye(3) - turned).reshape(-1, 3), target.ravel(), rcond=1e-6)
+    return centre, float(_SHEET_GAIN * lengths_of(windows.angle[rows]) / max(sizes[-1], 1e-12))
 
 
 def _axes(windows: FieldWindows, centre: FloatArray, southern: bool | None) -> FloatArray:
@@ -555,9 +550,9 @@ def _axes(windows: FieldWindows, centre: FloatArray, southern: bool | None) -> F
         cost = 0.0
         if windows.turn.any():
             moved = (np.einsum("nij,nj->ni", windows.carried, np.roll(body, -1, axis=0)) - body)[windows.turn]
-            cost += float(np.mean(np.sum(moved**2, axis=1))) / float(np.mean(length**2))
+            cost += float((moved**2).sum(axis=1).mean()) / float((length**2).mean())
         if calm.any():
-            cost += float(np.var(dot_rows(windows.up[calm], body[calm]) / length[calm]))
+            cost += float((dot_rows(windows.up[calm], body[calm]) / length[calm]).var())
         costs.append(cost)
     best = ARRANGEMENTS[0 if min(costs) > 0.8 * costs[0] else int(np.argmin(costs))]
     if southern is not None and windows.level.any():
@@ -611,7 +606,7 @@ def _magnetometer(imu: Imu) -> Triad:
 
 def _scale_of(imu: Imu) -> float:
     """Output units of the magnetometer to a µT."""
-    return float(np.mean(_magnetometer(imu).scales))
+    return float(_magnetometer(imu).scales.mean())
 
 
 def _strengths(imu: Imu, output: FloatArray) -> FloatArray:
@@ -653,11 +648,13 @@ def _undisturbed(
         windows = whole.without(far)
         fit = _fitted(start, windows, field, full)  # along what is open the first one may have crept away
     left = ~windows.used
+    if not left.any():
+        return fit, windows, []
     note = (
         f"the field is disturbed in {left.sum()} of {len(left)} windows, {_spans(whole.time[left])}; they were left "
         "out. Iron, a magnet or a current came near, or a jerk tilted the measured vertical."
     )
-    return fit, windows, [note] if left.any() else []
+    return fit, windows, [note]
 
 
 def _disturbed(imu: Imu, windows: FieldWindows, whole: FieldWindows) -> BoolArray:
@@ -675,7 +672,7 @@ def _disturbed(imu: Imu, windows: FieldWindows, whole: FieldWindows) -> BoolArra
     for values, known, least in ((length, whole.used, noise), (dip, whole.calm, shaken + noise / np.median(length))):
         usual = known & windows.used
         if usual.any():
-            off = np.where(known, np.abs(values - np.median(values[usual])), 0.0)
+            off = np.where(known, abs(values - np.median(values[usual])), 0.0)
             size = np.maximum(size, off / np.maximum(robust_sigma(off[usual]), least))
     far = scipy.ndimage.binary_propagation(size > _DISTURBED, mask=size > _BESIDE)
     return far | scipy.ndimage.binary_closing(far, np.ones(_BETWEEN))
@@ -687,12 +684,12 @@ def _refuse_changed(fit: Fit, windows: FieldWindows, field: FieldStrength, where
     least = max(len(strength) // 10, 2)
     if not np.isfinite(strength).all() or len(strength) < 4 * least:
         return
-    count, total = np.arange(1, len(strength)), np.cumsum(strength)
+    count, total = np.arange(1, len(strength)), strength.cumsum()
     rest = count[::-1]
     before, after = total[:-1] / count, (total[-1] - total[:-1]) / rest
     gain = (count * rest * (after - before) ** 2)[least - 1 : 1 - least]
-    last = int(np.argmax(gain)) + least - 1
-    scatter = np.std(np.concatenate([strength[: last + 1] - before[last], strength[last + 1 :] - after[last]]))
+    last = int(gain.argmax()) + least - 1
+    scatter = np.concatenate([strength[: last + 1] - before[last], strength[last + 1 :] - after[last]]).std()
     if abs(after[last] - before[last]) > max(_STEP * field.value, _CLEAR * scatter):
         raise NotPossibleError(
             f"{where}: the field is of {before[last]:.3g} µT until {windows.time[windows.used][last, 1]:.1f} s and of "
@@ -702,13 +699,9 @@ def _refuse_changed(fit: Fit, windows: FieldWindows, field: FieldStrength, where
 
 def _spans(times: FloatArray, shown: int = 5) -> str:
     """Name stretches (k, 2) of time, neighbours as one."""
-    joined: list[list[float]] = []
-    for start, stop in times:
-        if joined and 0 <= start - joined[-1][1] < 1.0:
-            joined[-1][1] = stop
-        else:
-            joined.append([start, stop])
-    words = [f"{start:.1f} to {stop:.1f} s" for start, stop in joined[:shown]]
+    gaps = times[1:, 0] - times[:-1, 1]
+    joined = np.split(times, 1 + np.flatnonzero((gaps < 0) | (gaps >= 1.0)))
+    words = [f"{stretch[0, 0]:.1f} to {stretch[-1, 1]:.1f} s" for stretch in joined[:shown]]
     return ", ".join(words) + (f" and {len(joined) - shown} more stretches" if len(joined) > shown else "")
 
 
@@ -716,7 +709,7 @@ def _samples(logs: Sequence[MagneticLog], parts: Sequence[FieldWindows]) -> list
     """Return the samples (m, 3) of each window, those included that no mean took."""
     samples = []
     for log, part in zip(logs, parts, strict=True):
-        edges = np.searchsorted(log.magnetometer.time, part.time)
+        edges = log.magnetometer.time.searchsorted(part.time)
         samples += [log.magnetometer.values[first : last + 1] for first, last in edges]
     return samples
 
@@ -724,9 +717,9 @@ def _samples(logs: Sequence[MagneticLog], parts: Sequence[FieldWindows]) -> list
 def _require_covered(fit: Fit, windows: FieldWindows, where: str) -> None:
     """Refuse what is no calibration: hard iron left open, or by itself more than a third of the parameters."""
     covariance = relative_covariance(fit)
-    iron = [row for row, name in enumerate(fit.names) if name.owner == "magnetometer" and name.part == "bias"]
+    iron = [(name.owner, name.part) == ("magnetometer", "bias") for name in fit.names]
     iron_open, left = (
-        int(np.sum(np.linalg.eigvalsh(part) > UNDETERMINED**2)) for part in (submatrix(covariance, iron), covariance)
+        int((np.linalg.eigvalsh(part) > UNDETERMINED**2).sum()) for part in (submatrix(covariance, iron), covariance)
     )
     share = 100 * coverage(fit.imu, windows)
     if iron_open or (windows.alone and left > len(fit.names) // 3) or (not fit.converged and share < 50):
@@ -741,13 +734,9 @@ def _open_words(names: Sequence[Name], wide: BoolArray) -> str:
     axes: dict[str, list[str]] = {}
     for name, open_ in zip(names, wide, strict=True):
         if open_ and name.effect is None:
-            if name.owner == "gyroscope":
-                part = "the gyroscope's bias about"
-            elif name.part == "bias":
-                part = "hard iron along"
-            else:
-                part = "the scale of" if name.axes[0] == name.axes[-1] else "soft iron and alignment of"
-            axes.setdefault(part, []).append("xyz"[name.axes[0]])
+            gain = "the scale of" if name.axes[0] == name.axes[-1] else "soft iron and alignment of"
+            bias = "the gyroscope's bias about" if name.owner == "gyroscope" else "hard iron along"
+            axes.setdefault(bias if name.part == "bias" else gain, []).append("xyz"[name.axes[0]])
     if not axes:
         return "combinations of hard iron, soft iron and scale"
     return listed([f"{part} {listed(list(dict.fromkeys(letters)))}" for part, letters in axes.items()])
@@ -786,7 +775,7 @@ def _left_out(
     for name, parts in strengths.items():
         if parts:
             values = np.concatenate(parts)
-            spreads[name] = float(np.std(values) / np.mean(values))
+            spreads[name] = float(values.std() / values.mean())
     off = {name: np.concatenate([np.zeros(0), *parts]) for name, parts in headings.items()}
     turned = {name: rms(np.degrees(errors)) for name, errors in off.items() if len(errors)}
     return spreads, turned or None
@@ -811,7 +800,7 @@ def carried_headings(windows: FieldWindows, imu: Imu, rows: IntArray) -> FloatAr
             yaw.append(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
             carried = carried @ windows.carried[row]
         time = windows.time[part].mean(axis=1)
-        design = np.stack([np.ones(len(time)), time - time.mean()], axis=1)[calm]
+        design = np.column_stack([np.ones(len(time)), time - time.mean()])[calm]
         angle = np.unwrap(yaw)[calm]
         errors.append(angle - design @ np.linalg.lstsq(design, angle, rcond=None)[0])
     return np.concatenate(errors)
@@ -822,8 +811,7 @@ def carried_headings(windows: FieldWindows, imu: Imu, rows: IntArray) -> FloatAr
 
 def coverage(imu: Imu, windows: FieldWindows) -> float:
     """Return the share of all directions that the field had, in the magnetometer's axes, to within 15°."""
-    field = unit_vectors(windows.field(imu)[windows.used])
-    return float(np.mean((spiral(400) @ field.T).max(axis=1) > _NEAR))
+    return float(((spiral(400) @ unit_vectors(windows.field(imu)[windows.used]).T).max(axis=1) > _NEAR).mean())
 
 
 def _dip(windows: FieldWindows, fit: Fit) -> tuple[float | None, float]:
@@ -855,7 +843,7 @@ def heading_errors(calibration: Calibration, start: Imu, strength: float, dip: f
     body, slope = _heading_slopes(known.names, triad, attitude, strength, dip)
     sigma = root_or_zero(dot_rows(slope @ known.covariance, slope))
     level = attitude.apply(np.linalg.solve(before.gain, (body @ triad.gain.T + triad.bias).T).T)
-    off = np.abs(np.arctan2(level[:, 0], level[:, 1]))
+    off = abs(np.arctan2(level[:, 0], level[:, 1]))
     scatter = np.sqrt(calibration.excess.get(EXCESS_NAMES[0], 0.0)) * 0.1 / (strength * np.cos(dip))
     sigma, off = (np.degrees(values).reshape(len(tilts), len(headings)) for values in (sigma, off))
     return Heading(headings, tilts, sigma, off, float(np.degrees(scatter)))
@@ -889,7 +877,7 @@ def hard_iron(calibration: Calibration) -> tuple[float, float]:
     iron = np.linalg.solve(gain, bias)
     known = calibration.of_numbers(_of_iron)
     slope = unit_vectors(iron) @ _reactions(known.names, -iron[None], gain)[0]
-    return float(np.linalg.norm(iron)), float(root_or_zero(slope @ known.covariance @ slope))
+    return float(lengths_of(iron)), float(root_or_zero(slope @ known.covariance @ slope))
 
 
 def _reactions(names: Sequence[Name], field: FloatArray, gain: FloatArray) -> FloatArray:
@@ -918,15 +906,15 @@ def next_directions(calibration: Calibration, measurement: MagneticField, dip: f
     reaction = np.einsum("ni,nik->nk", grid, _reactions(known.names, measurement.strength * grid, triad.gain)) / sigma
 
     def accuracy() -> float:
-        return float(np.degrees(np.sqrt(np.mean(dot_rows(heading @ spread, heading)))))
+        return float(np.degrees(np.sqrt(dot_rows(heading @ spread, heading).mean())))
 
     before, chosen = accuracy(), []
     for _ in range(count):
         moved = reaction @ spread
-        gains = np.sum((moved @ heading.T) ** 2, axis=1) / (1 + dot_rows(moved, reaction))
-        best = int(np.argmax(gains))
+        gains = ((moved @ heading.T) ** 2).sum(axis=1) / (1 + dot_rows(moved, reaction))
+        best = int(gains.argmax())
         chosen.append(grid[best].tolist())
-        spread = spread - np.outer(moved[best], moved[best]) / (1 + moved[best] @ reaction[best])
+        spread -= np.outer(moved[best], moved[best]) / (1 + moved[best] @ reaction[best])
     return {"directions": chosen, "heading_now": before, "heading_then": accuracy(), "unit": "deg"}
 
 
@@ -942,16 +930,16 @@ def field_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, m
         return "half a minute at rest, for the gyroscope's bias."
     change, shift = inverse @ change, inverse @ shift / _TYPICAL
     grid = spiral(200)
-    strength = np.abs(dot_rows(grid @ change, grid) + grid @ shift)
+    strength = abs(dot_rows(grid @ change, grid) + grid @ shift)
     turn = 0.5 * (change[[2, 0, 1], [1, 2, 0]] - change[[1, 2, 0], [2, 0, 1]])
-    if np.linalg.norm(turn) > 1.5 * strength.max():  # up · (turn × field) is largest where the turn's axis points east
+    if lengths_of(turn) > 1.5 * strength.max():  # up · (turn × field) is largest where the turn's axis points east
         return f"rests in which the unit's {_longest(turn)} axis lies level and points east, and rests with it west."
-    best = _longest(grid[int(np.argmax(strength))])
+    best = _longest(grid[int(strength.argmax())])
     return f"turns in which the unit's {best} axis points along the field and against it."
 
 
 def _longest(direction: FloatArray) -> str:
-    return "xyz"[int(np.argmax(np.abs(direction)))]
+    return "xyz"[int(abs(direction).argmax())]
 
 
 def _data(logs: Sequence[MagneticLog], windows: FieldWindows) -> Json:
@@ -964,7 +952,7 @@ def _gyroscope_bias(calibration: Calibration) -> Json | None:
     """Return the gyroscope's bias (3), output units, that the carried field tells."""
     if not any(name.owner == "gyroscope" for name in calibration.names):
         return None
-    triad = calibration.imu.triads()["gyroscope"]
+    triad = calibration.imu.triad("gyroscope")
     sigma = calibration.sigma("gyroscope")[1]
     return {"value": triad.bias.tolist(), "sigma": sigma.tolist(), "unit": triad.output_unit}
 

@@ -96,7 +96,7 @@ def _open(means: PoseMeans) -> bool:
     """
     values = means.recording.accelerometer.si()
     upright = (values - (values.max(axis=0) + values.min(axis=0)) / 2) / STANDARD_GRAVITY
-    return bool(np.sort(np.abs(upright), axis=1)[:, 1].max() < _UPRIGHT)
+    return bool(np.sort(abs(upright), axis=1)[:, 1].max() < _UPRIGHT)
 
 
 def _as_written(means: PoseMeans) -> PoseMeans:
@@ -112,7 +112,7 @@ def _step(values: FloatArray) -> float:
     for digits in range(7):
         for unit in (1.0, STANDARD_GRAVITY):
             scaled = values / unit * 10.0**digits
-            if (np.abs(scaled - scaled.round()) < 1e-6 * np.maximum(np.abs(scaled), 1.0)).all():
+            if (abs(scaled - scaled.round()) < 1e-6 * np.maximum(abs(scaled), 1.0)).all():
                 return unit * 10.0**-digits
     return 1e-6
 

@@ -62,8 +62,7 @@ def _forces(recording: Recording) -> FloatArray:
     """
     force = recording.accelerometer.si()
     size = max(1, recording.accelerometer.samples(_BLOCK))
-    count = len(force) // size
-    if count < 2 * _FEWEST:
+    if (count := len(force) // size) < 2 * _FEWEST:
         return np.ones(3)
     parts = force[: count * size].reshape(count, size, 3)
     varied = parts.var(axis=1).sum(axis=1)
@@ -75,7 +74,7 @@ def _forces(recording: Recording) -> FloatArray:
     if not (inverse > 0).all():
         return np.ones(3)
     factors = 1 / np.sqrt(inverse)
-    return np.asarray(np.where(np.abs(np.log(factors)) > _ODD, factors, 1.0), np.float64)
+    return np.asarray(np.where(abs(np.log(factors)) > _ODD, factors, 1.0), np.float64)
 
 
 def _start(motion: Turning) -> FloatArray:
@@ -85,4 +84,4 @@ def _start(motion: Turning) -> FloatArray:
     if angle_of(rotation_of(rest)) > _MOUNTED:
         return motion.matrix
     scales = np.maximum(np.diag(rest), 1e-6)
-    return np.asarray(arranged * np.where(np.abs(np.log(scales)) > _SAME, scales, 1.0), np.float64)
+    return np.asarray(arranged * np.where(abs(np.log(scales)) > _SAME, scales, 1.0), np.float64)

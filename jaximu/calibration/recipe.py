@@ -152,9 +152,7 @@ def _calibrated_jointly(
     notes = [*notes_of(*ready), *mixed, *notes_of(*recorded, *parts, noise)]
     if noise is None and recorded:
         notes.append(f"{_NO_DRIFT}, unless data were observed with a noise model.")
-    unit = Imu.nominal() if start is None else start
-    if start is None and recorded:
-        unit = nominal_imu(recorded[0])
+    unit = start or (nominal_imu(recorded[0]) if recorded else Imu.nominal())
     if "magnetometer" in unit.triads():
         raise InputError("the start has a magnetometer, which these data do not determine: start without it.")
     if unit.setup and sum(not one.no_fixture for one in data) > 1:
@@ -309,18 +307,18 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     nominal = nominal_imu(recordings[0])
     fitted = fit_hand_held(nominal, observations, method, loss)
     where = ", ".join(recording.name for recording in recordings)
-    poses, turns = (int(np.sum(part.mask)) for part in (observations.poses, observations.turns))
+    poses, turns = (int(part.mask.sum()) for part in (observations.poses, observations.turns))
     require_determined(fitted, where, poses=poses)
     fitted, held = with_open_misalignments_held(fitted, nominal, observations, method, loss)
     require_determined(fitted, where, prior=held)
     keep_gyroscope = method != "accelerometer"
     before = residual_rms(nominal, observations, keep_gyroscope)
     sigmas, prior = dict(choices.effect_sigmas or {}), held
-    if method == "joint" and gravity.latitude is not None:
-        if GyroEarthRotation.name not in [effect.name for effect in chosen]:
-            earth = _earth_rotations(gravity.latitude, _headings_carried(segmentations, observations))
-            chosen += [effect for effect, _ in earth]
-            sigmas |= {effect.name: spread for effect, spread in earth}
+    known = {effect.name for effect in chosen}
+    if method == "joint" and gravity.latitude is not None and GyroEarthRotation.name not in known:
+        earth = _earth_rotations(gravity.latitude, _headings_carried(segmentations, observations))
+        chosen += [effect for effect, _ in earth]
+        sigmas |= {effect.name: spread for effect, spread in earth}
     if chosen:
         measurement = RecordedByHand(segmentations, observations)
         start = on_host(fitted.imu).with_effects(*chosen)
@@ -373,7 +371,7 @@ def _headings_carried(segmentations: Sequence[Segmentation], observations: Obser
     usable, carried = np.asarray(observations.turns.mask), []
     for part in segmentations:
         touching = part.intervals[1:, 0] <= part.intervals[:-1, 1]
-        carried.append(bool(np.all(usable[: len(touching)] | touching)))
+        carried.append(bool((usable[: len(touching)] | touching).all()))
         usable = usable[len(part.intervals) :]
     return carried
 
@@ -395,4 +393,4 @@ def _mean_temperature(recordings: Sequence[Recording], observations: Observation
     if any(recording.temperature is None for recording in recordings):
         return {}
     poses = observations.poses
-    return {"temperature": float(np.mean(np.asarray(poses.temperature)[np.asarray(poses.mask)]))}
+    return {"temperature": float(np.asarray(poses.temperature)[np.asarray(poses.mask)].mean())}

@@ -61,8 +61,7 @@ def require_excited(fitted: Fit, where: str, shown: str, record: str) -> None:
         rows = [index for index, name in enumerate(fitted.names) if name.owner == triad and name.effect is None]
         if not rows:
             continue
-        left = _open_directions(covariance, rows)
-        if left <= len(rows) // 2:
+        if (left := _open_directions(covariance, rows)) <= len(rows) // 2:
             return
         parts.append(f"{left} of the {triad}'s {len(rows)} parameters")
     raise NotPossibleError(f"{where}: {shown} leave {' and '.join(parts)} open. {record}")
@@ -76,8 +75,7 @@ def require_spanning(
     covariance: (p, p) of the parameters over their typical sizes. sensor: what stands in the accelerometer's place.
     """
     rows = [index for index, name in enumerate(names) if name.owner == "accelerometer"]
-    open_directions = _open_directions(covariance, rows)
-    if open_directions > len(rows) // 3:
+    if (open_directions := _open_directions(covariance, rows)) > len(rows) // 3:
         raise NotPossibleError(
             f"{where}: the {poses} poses found do not span enough orientations: they leave {open_directions} of the "
             f"{sensor}'s {len(rows)} parameters open. Record at least nine poses, each axis pointing up and down "
@@ -97,8 +95,7 @@ def refuse_undetermined(fitted: Fit, prior: Prior | None, wholly: bool = False) 
         if not members.any() or any(name in known for name, mine in zip(fitted.names, members, strict=True) if mine):
             continue
         columns, others = jacobian[:, members], jacobian[:, ~members]
-        left = off(orthonormal(others), columns)
-        least = np.linalg.svd(left, compute_uv=False)[0 if wholly else -1]
+        least = np.linalg.svd(off(orthonormal(others), columns), compute_uv=False)[0 if wholly else -1]
         if not least > 1e-6 * np.linalg.norm(columns):
             raise NotPossibleError(
                 f"{sentence(effect.title)} cannot be distinguished here from bias, scale and misalignment"
@@ -115,7 +112,7 @@ def refuse_undetermined(fitted: Fit, prior: Prior | None, wholly: bool = False) 
 
 def relative_covariance(fitted: Fit) -> FloatArray:
     """Return the covariance (p, p) of a fit's parameters over their typical sizes."""
-    return np.asarray(fitted.covariance) / fitted.sizes[:, None] / fitted.sizes
+    return np.asarray(fitted.covariance) / np.outer(fitted.sizes, fitted.sizes)
 
 
 def _open_directions(covariance: FloatArray, rows: Sequence[int]) -> int:

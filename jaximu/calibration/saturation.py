@@ -31,10 +31,10 @@ def saturation(calibration: Calibration) -> list[Finding]:
     if variance < _COARSE:
         return []
     # the limit is the output's: the fitted gain is wrong by what it bends
-    scale = nominal.triads()["gyroscope"].scales
-    bias, inside = calibration.imu.triads()["gyroscope"].bias, turns.interval > 0
+    scale = nominal.triad("gyroscope").scales
+    bias, inside = calibration.imu.triad("gyroscope").bias, turns.interval > 0
     rate = np.where(inside[..., None], (turns.output - bias) / scale, 0.0)
-    greatest = float(np.abs(rate).max())
+    greatest = float(abs(rate).max())
 
     def scatter(changed) -> float:
         turned = replace(turns, output=bias + scale * changed)

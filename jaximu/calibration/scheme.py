@@ -16,9 +16,9 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
 from jaximu.ground.vectors import column_lengths, dot_rows, lengths_of
 from jaximu.recordings.observations import Stations
+from jaximu.simulation.protocols.positions import FACES
 
 _OPEN = 1e-6  # singular value, as a share of the largest, below which nothing is determined
-_FACES = [sign * np.eye(3)[axis] for axis in range(3) for sign in (1.0, -1.0)]
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def _scheme(triad: str, inputs: FloatArray) -> Scheme:
     size = lengths_of(inputs).max(initial=0.0)
     design = np.column_stack([inputs / (size or 1.0), np.ones(len(inputs))]).reshape(-1, 4)
     values, right = _spectrum(design)
-    rank = int(np.sum(values > _OPEN * values[0]))
+    rank = int((values > _OPEN * values[0]).sum())
     condition = float(values[0] / values[rank - 1]) if rank else np.inf
     share = column_lengths(right[rank:])
     open_columns = [k for k in range(4) if share[k] > 1e-3]
@@ -94,10 +94,10 @@ def _remedies(triad: str, design: FloatArray) -> tuple[str, ...]:
     """Add, one after the other, the pose or turn that excites most of what is still open."""
     names: Sequence[str]
     if triad == "accelerometer":
-        rows = [np.append(up, 1.0) for up in _FACES]
+        rows = [np.append(up, 1.0) for up in FACES]
         names = [f"a pose with {sign}{axis} up" for axis in "xyz" for sign in "+−"]
     else:
-        rows = [np.array([0.0, 0.0, 0.0, 1.0]), *(np.append(axis, 1.0) for axis in _FACES)]
+        rows = [np.append(axis, 1.0) for axis in (np.zeros(3), *FACES)]
         names = ["a rest", *(f"a turn about {sign}{axis}" for axis in "xyz" for sign in "+−")]
     added = []
     for _ in range(4):

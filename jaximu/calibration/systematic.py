@@ -98,7 +98,7 @@ def disturbances(noise: NoiseModel, scale: Mapping[str, float] | None = None) ->
     **Arguments:** `scale`: of the variances in a rest and in motion, as a filter found them (`filter.noise`).
     """
     white, variance, times = merged_drift(noise, SHORTEST, DRIFTS)
-    creep = 1e-2 * np.min(white[:3])
+    creep = 1e-2 * white[:3].min()
     rest, motion = (1.0, 1.0) if scale is None else (scale["rest"], scale["motion"])
     arrival = np.float64(_ARRIVAL * np.sqrt(motion))
     return Disturbances(motion * white, rest * white, variance, times, creep, arrival, _LOST)
@@ -253,8 +253,7 @@ def _settled(
         require_solved(fitted, name)
         imu = on_host(fitted.imu)
         followed = _followed(measurement, imu, prior, gravity, start)
-        matched = _matched(measurement, followed)
-        if matched is None:
+        if (matched := _matched(measurement, followed)) is None:
             break
         measurement = matched
     return fitted, followed, measurement
@@ -384,7 +383,7 @@ def _scaled_noise(errors: Disturbances, noise: NoiseModel, excess: float) -> dic
     """Return how much larger the variances in rests and in motion were than the noise says, misfit included."""
     white = disturbances(noise).white
     return {
-        name: (1 + excess) * float(np.mean(density / white))
+        name: (1 + excess) * float((density / white).mean())
         for name, density in (("rest", errors.rest), ("motion", errors.white))
     }
 
@@ -403,8 +402,7 @@ def _followed(
     rows = [free.names.index(name) for name in prior.names]
     mean[rows], sigma[rows] = prior.mean - reference[rows], 1 / np.diagonal(prior.root)
     sigma = np.append(sigma, max(gravity.sigma, 1e-6))
-    known = Knowledge(np.diag(1 / sigma), np.append(mean, 0.0) / sigma)
-    return measurement.followed(imu, index, known)
+    return measurement.followed(imu, index, Knowledge(np.diag(1 / sigma), np.append(mean, 0.0) / sigma))
 
 
 def _matched(measurement: IntervalsOfMotion, followed: FilterPass) -> IntervalsOfMotion | None:

@@ -112,7 +112,7 @@ class ThermalCalibration(Result, Document, page="thermal"):
                         "terms": len(candidate.terms),
                         "heldout_rms": candidate.held.rms.tolist(),
                         "heldout_loglik": candidate.held.log_likelihood,
-                        "criterion": float(np.sum(candidate.costs)),
+                        "criterion": float(candidate.costs.sum()),
                         "score": candidate.score,
                         "score_by_axis": candidate.scores.tolist(),
                     }
@@ -228,15 +228,13 @@ def _notes(name: str, fit: TriadFit, parts: str) -> list[str]:
             f"the {name}'s model is a neural network, whose 95 % band holds a network's uncertainty only: where "
             "the truth is another curve it covers less, about four fifths in simulations. Check it on another ramp."
         )
-    worst = float(np.max(fit.chi_squared))
-    if worst > _MISFIT:
+    if (worst := float(fit.chi_squared.max())) > _MISFIT:
         notes.append(
             f"the {name}'s residuals are {np.sqrt(worst):.2g} times what the noise explains: something depends on "
             "more than this model has (a field of temperatures in the device, tilt, another cause); intervals are "
             "widened by as much."
         )
-    plain = ["xyz"[axis] for axis, family in enumerate(fit.families) if family == "constant"]
-    if plain:
+    if plain := ["xyz"[axis] for axis, family in enumerate(fit.families) if family == "constant"]:
         notes.append(
             f"the {name}'s {', '.join(plain)} output is left as it is: no model of temperature corrects it on {parts} "
             "left out."
@@ -281,14 +279,14 @@ def _jumps(blocks: RestBlocks, residuals: dict[str, FloatArray]) -> list[int]:
         edges, change, usual = _changes(blocks, residual)
         if len(edges) < _FEWEST:
             return []
-        times = np.abs(change) / usual
+        times = abs(change) / usual
         # a jump is over within two blocks; what takes longer is a lag that was not in equilibrium
-        near = [np.abs(residual[edges + b] - residual[edges + a]) for a, b in ((-1, 0), (-1, 1), (-2, 0))]
-        times[np.max(near, axis=0) < _SHARP * np.abs(change)] = 0.0
-        while len(jumps) < _MOST_JUMPS and np.max(times) > _JUMP:
-            block = int(edges[int(np.argmax(np.max(times, axis=1)))])
+        near = [abs(residual[edges + b] - residual[edges + a]) for a, b in ((-1, 0), (-1, 1), (-2, 0))]
+        times[np.max(near, axis=0) < _SHARP * abs(change)] = 0.0
+        while len(jumps) < _MOST_JUMPS and times.max() > _JUMP:
+            block = int(edges[int(times.max(axis=1).argmax())])
             jumps.append(block)
-            times[np.abs(edges - block) < 2 * _BESIDE] = 0.0
+            times[abs(edges - block) < 2 * _BESIDE] = 0.0
     jumps.sort()
     return [after for before, after in pairwise([-2 * _BESIDE, *jumps]) if after - before >= 2 * _BESIDE]
 
@@ -301,7 +299,7 @@ def _changes(blocks: RestBlocks, values: FloatArray) -> tuple[IntArray, FloatArr
         return edges, np.zeros((0, 3)), np.ones(3)
     around = edges[:, None] + np.arange(_BESIDE)
     change = np.median(values[around], axis=1) - np.median(values[around - _BESIDE], axis=1)
-    usual = np.maximum(np.median(np.abs(change), axis=0) / 0.6745, 0.05 * np.std(change, axis=0))  # coarse steps
+    usual = np.maximum(np.median(abs(change), axis=0) / 0.6745, 0.05 * change.std(axis=0))  # coarse steps
     return edges, change, np.maximum(usual, 1e-300)
 
 
@@ -311,14 +309,14 @@ def _told_jumps(blocks: RestBlocks, fits: Mapping[str, TriadFit], jumps: Sequenc
     for name, fit in fits.items():
         edges, change, usual = _changes(blocks, blocks.means[name] - fit.fitted)
         for block in jumps:
-            by_axis = change[np.searchsorted(edges, block)]
-            times = np.abs(by_axis) / usual
+            by_axis = change[edges.searchsorted(block)]
+            times = abs(by_axis) / usual
             axes = np.flatnonzero(times > _JUMP / 2)
             if len(axes):
                 by = [f"{size(float(by_axis[axis]), SENSOR_UNITS[name], 2)} ({'xyz'[axis]})" for axis in axes]
                 notes.append(
                     f"the {name}'s output jumps by {listed(by)} at "
-                    f"{blocks.start[block]:.0f} s, {blocks.temperature[block]:.1f} °C, {np.max(times):.0f} times the "
+                    f"{blocks.start[block]:.0f} s, {blocks.temperature[block]:.1f} °C, {times.max():.0f} times the "
                     "usual change: a knock, or a part that gave way. It was kept apart from temperature: what comes "
                     "after has its own bias. `compensate` leaves the jump in."
                 )
@@ -341,9 +339,9 @@ def _calibration(
     covariances = [covariance]
     triads: dict[str, Any] = {}
     for name, fit in fits.items():
-        triad, of_fit = unit.triads()[name], base is None and name == "gyroscope"  # its bias is that of the fit
+        triad, of_fit = unit.triad(name), base is None and name == "gyroscope"  # its bias is that of the fit
         kept = tuple(effect for effect in triad.effects if effect.plain not in THERMAL)
-        bias, temperature = fit.fit.imu.triads()[name].bias, reference
+        bias, temperature = fit.fit.imu.triad(name).bias, reference
         if not of_fit:
             if base is not None and len(kept) == len(triad.effects):
                 temperature = float(base.data.get("temperature", reference))
@@ -381,7 +379,7 @@ def _calibration(
         rms=norms if base is None else base.rms | norms,
         rank=len(names),
         weak=() if base is None else base.weak,
-        excess={name: float(np.max(fit.fit.excess)) for name, fit in fits.items()},
+        excess={name: float(fit.fit.excess.max()) for name, fit in fits.items()},
         solver=next((failure for failure in ended if failure is not Failure.NONE), Failure.NONE).value,
         data=_data(blocks, base),
         reading=recording.reading if base is None or base.reading is None else base.reading,
@@ -431,10 +429,9 @@ def _numbers(fit: TriadFit, with_bias: bool, signal: Signal, levels: int) -> tup
     fitted = {name: row for row, name in enumerate(fit.fit.names) if with_bias or name.part != "bias"}
     coefficients = [name for name in effect_numbers(fit.fit.imu)[0] if name in fitted or name.part == "coefficients"]
     names = list(dict.fromkeys((*coefficients, *fitted)))
-    rows = [fitted.get(name, -1) for name in names]
-    covariance = submatrix(np.pad(fit.fit.covariance, (0, 1)), rows)
+    covariance = submatrix(np.pad(fit.fit.covariance, (0, 1)), [fitted.get(name, -1) for name in names])
     if with_bias and levels > 1:
-        covariance[-3:, -3:] += np.diag(np.var(fit.level, axis=1, ddof=1) * signal.nominal_scale**2 / levels)
+        covariance[-3:, -3:] += np.diag(fit.level.var(axis=1, ddof=1) * signal.nominal_scale**2 / levels)
     return names, covariance
 
 
@@ -467,7 +464,7 @@ def change(
     origin, origin_slopes = steady(effects, reference, 0.0, reference, force)
     alone = effect_numbers(calibration.imu.with_effects(*effects))[0]
     numbers = [Name(owner, name.part, name.axes, rows[name.effect]) for name in alone if name.effect is not None]
-    slopes = slopes - origin_slopes
+    slopes -= origin_slopes
     variance = np.einsum("mak,kl,mal->ma", slopes, calibration.covariance_of(numbers), slopes)
     return values - origin, root_or_zero(variance)
 
@@ -492,4 +489,4 @@ def steady(
         temperature_reference=reference,
     )
     now = np.minimum(np.arange(len(ends)), count)
-    return mean_terms(effects, [Track(stimulus, np.stack([np.full(len(ends), count), now], axis=1))], count)
+    return mean_terms(effects, [Track(stimulus, np.column_stack([np.full(len(ends), count), now]))], count)

@@ -12,6 +12,7 @@ from jaximu.calibration.thermal_terms import Model, ThermalTerm, net_of
 from jaximu.data.rest_blocks import RestBlocks
 from jaximu.estimation.leave_out import LeftOut, leave_out, off, orthonormal
 from jaximu.ground.array_types import FloatArray, IntArray
+from jaximu.ground.vectors import column_lengths
 from jaximu.model.noise_model import NoiseModel
 
 
@@ -29,7 +30,7 @@ class Held:
     @property
     def log_likelihood(self) -> float:
         """Of the three axes, nats."""
-        return float(np.sum(self.by_axis))
+        return float(self.by_axis.sum())
 
 
 class Whitened:
@@ -39,7 +40,7 @@ class Whitened:
         self.blocks, self.name, self.shapes = blocks, name, shapes
         self.means = blocks.means[name]
         self.root = np.linalg.inv(np.linalg.cholesky(blocks.covariance(getattr(noise, name))))  # (3, n, n)
-        self.levels = self.root @ np.eye(blocks.levels)[blocks.level]
+        self.levels = self.root @ blocks.of_level
         self.output = (self.root @ self.means.T[:, :, None])[..., 0]
         self._columns: dict[ThermalTerm, FloatArray] = {}
 
@@ -58,8 +59,7 @@ class Whitened:
 
     def target(self, axis: int, terms: Sequence[ThermalTerm]) -> FloatArray:
         """Return what the design times levels and coefficients should be (n + p,): weights count from the network's."""
-        net = net_of(terms)
-        if net is None:
+        if (net := net_of(terms)) is None:
             return self.output[axis]
         beyond = self.output[axis] - self.root[axis] @ self.shapes.network(net)[0][axis]
         return np.concatenate([beyond, -net.weights[axis] / net.prior[axis]])
@@ -68,7 +68,7 @@ class Whitened:
         """Return an axis's coefficients (k,); the weights of a network are those about which it is linear."""
         net, plain = net_of(terms), [term for term in terms if term.net is None]
         design = self.design(axis, plain)
-        size = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+        size = np.maximum(column_lengths(design), 1e-300)
         numbers = np.linalg.lstsq(design / size, self.target(axis, terms)[: len(design)], rcond=1e-10)[0] / size
         return np.concatenate([numbers[self.blocks.levels :], np.zeros(0) if net is None else net.weights[axis]])
 
@@ -78,7 +78,7 @@ class Whitened:
 
     def misfit(self, axis: int, terms: Sequence[ThermalTerm]) -> float:
         """Return the sum of squares that least squares leaves of an axis."""
-        return float(np.sum(self.residual(axis, terms) ** 2))
+        return float((self.residual(axis, terms) ** 2).sum())
 
     def reduced(self, terms: Sequence[ThermalTerm]) -> Callable[[int, Sequence[ThermalTerm]], float]:
         """Return the misfit of any few of many terms, as a function that works on the triangle of their columns."""
@@ -89,7 +89,7 @@ class Whitened:
 
         def misfit(axis: int, terms: Sequence[ThermalTerm]) -> float:
             inside = triangles[axis][:, [*levels, *(columns[term] for term in terms)]]
-            return float(np.sum(off(orthonormal(inside), triangles[axis][:, -1]) ** 2))
+            return float((off(orthonormal(inside), triangles[axis][:, -1]) ** 2).sum())
 
         return misfit
 

@@ -51,7 +51,7 @@ def patterned(data: Whitened, model: Model, scale: FloatArray) -> bool:
     """Whether the best model leaves anything that a smooth function of temperature and its rate could follow."""
     for axis, terms in enumerate(model):
         free = _functions(data, axis, terms)
-        statistic = float(np.sum((free.T @ data.residual(axis, terms)) ** 2)) / scale[axis]
+        statistic = float(((free.T @ data.residual(axis, terms)) ** 2).sum()) / scale[axis]
         if float(chi2_sf(np.array(statistic), free.shape[1])) < _PATTERN:
             return True
     return False
@@ -65,13 +65,12 @@ def with_network(
     Returns with it the scale of the noise's variance, where the network explains more than what `scales` came from.
     """
     plain = (ThermalTerm(POWERS[0]), *(ThermalTerm(name) for name in more))
-    scale, left, freedom = float(np.mean(scales)), np.zeros(3), 1.0
+    scale, left, freedom = float(scales.mean()), np.zeros(3), 1.0
     for _ in range(_ROUNDS):
         net = _fitted(data, plain, scale, rated)
         left = np.array([data.misfit(axis, _about(plain, net)) for axis in range(3)])
         before, freedom = scale, len(data.blocks) - data.blocks.levels - parameters_of(_about(plain, net))
-        scale = float(np.clip(left.sum() / (3 * freedom), 1.0, scale))
-        if scale > 0.7 * before:
+        if (scale := float(np.clip(left.sum() / (3 * freedom), 1.0, scale))) > 0.7 * before:
             break
     scales = np.minimum(scales, np.maximum(left / freedom, 1.0))
     return candidate_of(data, "network", (_about(plain, net),) * 3, folds, scales), scales
@@ -90,7 +89,7 @@ def _functions(data: Whitened, axis: int, terms: Sequence[ThermalTerm]) -> Float
         for j in range(_ORDERS[1] + 1)
         if i / _ORDERS[0] + j / _ORDERS[1] <= 1
     ]
-    white = data.root[axis] @ np.stack(both, axis=1)
+    white = data.root[axis] @ np.column_stack(both)
     base = orthonormal(data.design(axis, terms))
     return off(base, orthonormal(off(base, white)))
 
@@ -116,8 +115,8 @@ def _solved(matrix, target, prior, start, inputs, origin):
         matrix, target, prior, start = axis
         solution = solve(_Axis(matrix, target, prior, inputs, origin), start, _STEPS, 1e-6)
         sizes = jnp.linalg.svd(solution.jacobian, compute_uv=False) ** 2
-        evidence = -solution.cost - 0.5 * jnp.sum(jnp.log1p(sizes))
-        return solution.z, evidence, jnp.sum(sizes / (1 + sizes))
+        evidence = -solution.cost - 0.5 * jnp.log1p(sizes).sum()
+        return solution.z, evidence, (sizes / (1 + sizes)).sum()
 
     return jax.lax.map(one, (matrix, target, prior, start))
 
@@ -135,7 +134,7 @@ def _fitted(data: Whitened, plain: Sequence[ThermalTerm], scale: float, rated: b
         stacked = np.pad(np.stack(matrices) / np.sqrt(scale), ((0, 0), (0, 0), (0, missing)))
         targets = np.einsum("amn,na->am", stacked[:, :, :count], data.means)
         starts = lanes[0].shape[1]
-        problems = (np.repeat(values, starts, axis=0) for values in (stacked, targets))
+        problems = (values.repeat(starts, axis=0) for values in (stacked, targets))
         rows = (values.reshape(3 * starts, WEIGHTS) for values in lanes)
         solutions = stored.call(_solved, "thermal network", *problems, *rows, inputs, data.shapes.origin)
         return [values.reshape(3, starts, -1) for values in solutions]
@@ -147,8 +146,8 @@ def _fitted(data: Whitened, plain: Sequence[ThermalTerm], scale: float, rated: b
         base = orthonormal(data.design(axis, plain))
         whole.append(np.pad(off(base, data.root[axis]), ((0, missing), (0, 0))))
         columns = [data.shapes.column(term)[axis] for term in plain]
-        basis = np.linalg.qr(np.column_stack([np.eye(data.blocks.levels)[data.blocks.level], *columns]))[0]
-        size.append(max(float(np.std(off(basis, data.means[:, axis]))), _LEAST_SIZE))
+        basis = np.linalg.qr(np.column_stack([data.blocks.of_level, *columns]))[0]
+        size.append(max(float(off(basis, data.means[:, axis]).std()), _LEAST_SIZE))
     starts = 0.5 * np.random.default_rng(_SEED).normal(size=(_STARTS, WEIGHTS))
     priors = np.array(
         [
@@ -161,6 +160,6 @@ def _fitted(data: Whitened, plain: Sequence[ThermalTerm], scale: float, rated: b
         ]
     )
     z, evidence, _ = solved(smooth, priors, np.tile(starts, (3, len(_PRIORS), 1)))
-    best = range(3), np.argmax(evidence[..., 0], axis=1)
+    best = range(3), evidence[..., 0].argmax(axis=1)
     z, _, determined = solved(whole, priors[best][:, None], z[best][:, None])
-    return Net(priors[best] * z[:, 0], priors[best] / np.sqrt(scale), float(np.sum(determined)) / 3)
+    return Net(priors[best] * z[:, 0], priors[best] / np.sqrt(scale), float(determined.sum()) / 3)

@@ -21,13 +21,13 @@ def multifactor(factors: Mapping[str, FloatArray], truth: FloatArray) -> tuple[l
     **Returns:** the terms that the Bayesian information criterion keeps, and the rms on stretches left out in turn.
     """
     count = len(truth)
-    scaled = {name: (values - np.mean(values)) / np.std(values) for name, values in factors.items()}
+    scaled = {name: (values - values.mean()) / values.std() for name, values in factors.items()}
     columns = {"1": np.ones(count)} | scaled
     for a, b in combinations_with_replacement(scaled, 2):
         columns[f"{a}²" if a == b else f"{a}·{b}"] = scaled[a] * scaled[b]
 
     def matrix(terms: Sequence[str]) -> FloatArray:
-        return np.stack([columns[term] for term in terms], axis=1)
+        return np.column_stack([columns[term] for term in terms])
 
     def criterion(terms: Sequence[str]) -> float:
         left = off(orthonormal(matrix(terms)), truth)

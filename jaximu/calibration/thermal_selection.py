@@ -64,7 +64,7 @@ class Candidate:
     @property
     def parameters(self) -> float:
         """How many numbers of the three axes the data determine."""
-        return float(np.sum(self.numbers))
+        return float(self.numbers.sum())
 
     @property
     def scores(self) -> FloatArray:
@@ -76,7 +76,7 @@ class Candidate:
     @property
     def score(self) -> float:
         """That of the three axes together."""
-        return float(np.sum(self.scores))
+        return float(self.scores.sum())
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -136,8 +136,7 @@ def exchanged(
 def tuned(data: Whitened, model: Model, scale: FloatArray) -> Model:
     """Return the model with its inner parameters, which the axes share, at the least misfit: a grid, refined."""
     used = memories(term.name for terms in model for term in terms)
-    grids = {name: grid for name, grid in data.shapes.grids.items() if name in used}
-    if not grids:
+    if not (grids := {name: grid for name, grid in data.shapes.grids.items() if name in used}):
         return model
     spacing = {name: float(grid[1] / grid[0]) for name, grid in grids.items()}
     touched = [axis for axis, terms in enumerate(model) if memories(term.name for term in terms)]
@@ -160,8 +159,7 @@ def tuned(data: Whitened, model: Model, scale: FloatArray) -> Model:
         best = min(product(*options.values()), key=cost)
         for term in best:
             name, bounds = term.name, data.shapes.grids[term.name][[0, -1]]
-            around = np.geomspace(1 / spacing[name], spacing[name], GRID)
-            grids[name] = np.clip(term.inner * around, *bounds)
+            grids[name] = (term.inner * np.geomspace(1 / spacing[name], spacing[name], GRID)).clip(*bounds)
             spacing[name] **= 2 / (GRID - 1)
     return at(best)
 

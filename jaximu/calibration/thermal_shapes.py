@@ -54,7 +54,7 @@ class ThermalShapes:
         }
         units = {name: CATALOGUE[f"accel.{name}"].inner[inner].unit for name, inner in HISTORY.items()}
         self.grids = {name: spans[unit] for name, unit in units.items()} if like is None else like.grids
-        fastest = float(np.max(np.abs(blocks.rate)))
+        fastest = float(abs(blocks.rate).max())
         self.bounds = {"low": low + ZERO_CELSIUS, "high": high + ZERO_CELSIUS, "reach": fastest}
         self.force = blocks.by_rest(blocks.means["accelerometer"])
         self.tracks = blocks.tracks(self.force, reference)
@@ -67,8 +67,8 @@ class ThermalShapes:
             self._columns[ThermalTerm(LEARNED, shape=k)] -= value
         self.prepare(self.grids)
         celsius, rates = np.append(blocks.temperature, reference), np.append(blocks.rate, 0.0)
-        inputs = np.stack([(2 * celsius - low - high) / (high - low), rates / max(fastest, 1e-12)], axis=1)
-        inputs = np.clip(inputs, -1.0, 1.0)
+        inputs = np.column_stack([(2 * celsius - low - high) / (high - low), rates / max(fastest, 1e-12)])
+        inputs = inputs.clip(-1.0, 1.0)
         self.inputs, self.origin = inputs[:-1], inputs[-1]
         self._nets: dict[Net, tuple[FloatArray, FloatArray]] = {}
 
@@ -111,7 +111,7 @@ class ThermalShapes:
 
     def smooth(self) -> FloatArray:
         """Return what a smooth function of temperature may be (n, 9)."""
-        return np.stack([self.column(ThermalTerm(LEARNED, shape=k))[0] for k in range(SPLINES)], axis=1)
+        return np.column_stack([self.column(ThermalTerm(LEARNED, shape=k))[0] for k in range(SPLINES)])
 
     def generous(self) -> FloatArray:
         """Return what temperature may plausibly do (n, 15), to tell noise from it.

@@ -139,7 +139,7 @@ def _concluded(
     freedom = len(blocks) - blocks.levels - chosen.numbers
     misfit = np.array([data.misfit(axis, terms) for axis, terms in enumerate(chosen.model)])
     fitted = _fitted(data, chosen.model, np.maximum(misfit / freedom, 1.0))
-    effects = tuple(fitted.imu.triads()[data.name].effects)
+    effects = tuple(fitted.imu.triad(data.name).effects)
     scale = blocks.recordings[0].signals[data.name].nominal_scale
     added = mean_terms(effects, data.shapes.tracks, len(blocks))[0] / scale
     rest = data.means - added
@@ -147,9 +147,9 @@ def _concluded(
         [np.linalg.lstsq(data.levels[axis], data.root[axis] @ rest[:, axis], rcond=None)[0] for axis in range(3)]
     )
     before, after = (blocks.left(data.name, output) for output in (data.means, rest))
-    rest = rest - level.T[blocks.level]
+    rest -= level.T[blocks.level]
     white = np.einsum("aij,ja->ai", data.root, rest)
-    chi = np.sum(white**2, axis=1) / freedom
+    chi = (white**2).sum(axis=1) / freedom
     return TriadFit(chosen, families, tuple(candidates), fitted, effects, level, rest, added, before, after, chi)
 
 

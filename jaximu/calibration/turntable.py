@@ -63,7 +63,7 @@ def fit_turntable(start: Imu, stations: Stations, free: Sequence[str] = (), loss
 
     **Returns:** a `Fit` with the same leading axes. Look at `converged` and `finite`; nothing is raised.
     """
-    on_table, force = free_on_table(start, free), bool(np.any(stations.accelerometer_used))
+    on_table, force = free_on_table(start, free), bool(stations.accelerometer_used.any())
 
     def seen(name: Name) -> bool:
         return on_table(name) and (force or name.owner != "accelerometer" or name.effect is not None)
@@ -156,7 +156,7 @@ def calibrate_table_ready(
     fitted = fit_turntable(start, stations, free, loss)
     where = ", ".join(recording.name for recording in recordings)
     used = stations.accelerometer_used | stations.gyroscope_used
-    poses, turns = (int(np.sum(used & (stations.turn == kind))) for kind in (False, True))
+    poses, turns = (int((used & (stations.turn == kind)).sum()) for kind in (False, True))
     shown = f"the reference has {counted(poses, 'pose')} and {counted(turns, 'turn')} that can be used, which"
     require_determined(fitted, where, shown, _RECORD)
     fitted = _at_rest_where_open(fitted, start)

@@ -28,7 +28,7 @@ from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.quantities import Z95
 from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.tracing import on_host
-from jaximu.ground.vectors import lengths_of, sigmas_of, variances_of
+from jaximu.ground.vectors import lengths_of, means_by_group, sigmas_of, variances_of
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.recordings.recording import Signal
@@ -87,17 +87,17 @@ def calibrate_at_stops(
     recording, signals = stops.recording, stops.recording.signals
     accelerometer, gyroscope = recording.accelerometer, signals["gyroscope"]
     force = rest_statistics(accelerometer, stops.intervals)[1] - accelerometer.nominal_offset
-    force = force / accelerometer.nominal_scale
+    force /= accelerometer.nominal_scale
     # after a few seconds of motion a vehicle stands on the same slope again
     sites = np.append(0, (stops.intervals[1:, 0] - stops.intervals[:-1, 1] > _ELSEWHERE).cumsum())
-    up = unit_vectors(np.mean(unit_vectors(_by_site(force, sites)), axis=0))
+    up = unit_vectors(unit_vectors(means_by_group(sites, force)).mean(axis=0))
     earth, spread = _earth(up, gravity.latitude)
     longest = np.sort((-np.diff(stops.intervals)[:, 0]).argsort()[:_MOST])
     rate, history = _rate(gyroscope, stops.intervals[longest], earth, known)
     scale = gyroscope.nominal_scale
     felt = scale[:, None] * spread * scale  # of the Earth's rotation, the same throughout
     nominal = as_stated(recording)
-    unit = replace(nominal, gyroscope=replace(nominal.triads()["gyroscope"], bias=rate.bias))
+    unit = replace(nominal, gyroscope=replace(nominal.triad("gyroscope"), bias=rate.bias))
     bias = (rate.bias - gyroscope.nominal_offset) / scale
     calibration = Calibration(
         imu=on_host(unit),
@@ -132,17 +132,12 @@ def calibrate_at_stops(
 
 
 def _undetermined(vehicle: Json) -> list[str]:
-    texts = []
-    if vehicle["roll"]["sigma"] is None:
-        texts.append(
-            "Slope of the road: stops at one site do not show it, so the mounting has no interval. Stop elsewhere, too."
-        )
-    if vehicle["forward"] is None:
-        texts.append(
-            "Direction of driving: what the unit felt in driving off and braking does not agree on one. Drive off and "
-            "brake briskly on straight, level road, forwards, five times or more."
-        )
-    return texts
+    slope = "Slope of the road: stops at one site do not show it, so the mounting has no interval. Stop elsewhere, too."
+    direction = (
+        "Direction of driving: what the unit felt in driving off and braking does not agree on one. Drive off and "
+        "brake briskly on straight, level road, forwards, five times or more."
+    )
+    return [slope] * (vehicle["roll"]["sigma"] is None) + [direction] * (vehicle["forward"] is None)
 
 
 # --- the gyroscope ----------------------------------------------------------------------------------------------------
@@ -171,28 +166,28 @@ def _rate(
     variance = {"gyroscope": variances_of(measured)}
     means = OutputMeans.of(start, stop, np.zeros(count, int), reaction, {"gyroscope": scale}, variance)
     values = (mean - scale * earth).ravel()
-    white = np.einsum("pq,pij->piqj", np.eye(count), measured).reshape(3 * count, -1)
+    white = scipy.linalg.block_diag(*measured)
     notes: tuple[str, ...] = ()
     if known is None:
         shown = estimated_drift(values, ones, white, [np.diag(np.diag(white))], means)
         covariance, noise, excess, notes = shown.covariance, shown.noise, shown.excess, shown.notes
     else:
         assert known.gyroscope is not None
-        slow = known.gyroscope.covariance(start, stop) * np.square(scale)[:, None, None]
+        slow = known.gyroscope.covariance(start, stop) * (scale**2)[:, None, None]
         covariance, noise, excess = np.zeros((count, 3, count, 3)), known, np.zeros(1)
         covariance[:, range(3), :, range(3)] = slow
         covariance, notes = covariance.reshape(3 * count, -1), known.notes
     bias, inverse, reactions = _least_squares(values, ones, covariance)
     after, sigmas = about_biases(names, inverse, reactions, means, noise)
     left = (values - ones @ bias).reshape(-1, 3) / scale
-    middle = np.repeat((start + stop) / 2, 3)[:, None]
+    middle = ((start + stop) / 2).repeat(3)[:, None]
     moved, moved_covariance, _ = _least_squares(values, np.hstack([ones, ones * (middle - middle.mean())]), covariance)
     length = float(stop[-1] - start[0])
     change, change_sigma = (length * part / scale for part in (moved[3:], sigmas_of(moved_covariance)[3:]))
     if count < 3:
         change, change_sigma = np.full((2, 3), np.nan)
-    trend = np.square(scale) * np.maximum(change**2 - np.square(Z95 * change_sigma), 0.0)
-    after = after + np.diag(np.nan_to_num(trend))  # what changed beyond chance may go on changing
+    trend = scale**2 * np.maximum(change**2 - (Z95 * change_sigma) ** 2, 0.0)
+    after += np.diag(np.nan_to_num(trend))  # what changed beyond chance may go on changing
     rate = _Rate(bias, after, sigmas["gyroscope"], change, change_sigma, left, excess, notes)
     return rate, _followed(names, start, stop, values.reshape(-1, 3), variance["gyroscope"], noise, scale)
 
@@ -229,10 +224,10 @@ def _followed(
         kept = np.exp(-gap / drift.correlation_time).repeat(3)
         driven = 1 / (spread * np.sqrt(np.maximum(1 - kept**2, _SHORTEST)))
         rows = WhiteRows(
-            np.concatenate([np.diag(-driven * kept), np.zeros((3, size))]),
-            np.concatenate([np.diag(driven), states / sigma[:, None]]),
-            np.concatenate([np.zeros((size, 3)), np.diag(1 / sigma)]),
-            np.concatenate([np.zeros(size), value / sigma]),
+            np.pad(np.diag(-driven * kept), ((0, 3), (0, 0))),
+            np.vstack([np.diag(driven), states / sigma[:, None]]),
+            np.pad(np.diag(1 / sigma), ((size, 0), (0, 0))),
+            np.pad(value / sigma, (size, 0)),
         )
         known, _, innovation = advance(known, rows)
         estimated, covariance = estimate(known)
@@ -252,11 +247,6 @@ def _followed(
 # --- the mounting -----------------------------------------------------------------------------------------------------
 
 
-def _by_site(values: FloatArray, sites: IntArray) -> FloatArray:
-    """Return the mean (S, k) over each site of values (P, k) at stops."""
-    return np.array([values[sites == site].mean(axis=0) for site in range(sites[-1] + 1)])
-
-
 def _mounted(
     stops: Segmentation,
     sites: IntArray,
@@ -272,7 +262,7 @@ def _mounted(
     across = np.linalg.svd(up[None])[2][1:]
     across[1] = np.cross(up, across[0])
     tilts = unit_vectors(force) @ across.T
-    different = _by_site(tilts, sites)
+    different = means_by_group(sites, tilts)
     covariance = _of_mean(different)
     sides, speeds = _speeds(stops, force, across, up, bias)
     forward, sigma, alike = _forward(sides, speeds)
@@ -286,6 +276,7 @@ def _mounted(
     quarter = np.array([[0.0, 1.0], [-1.0, 0.0]])  # a turn about one direction moves up along the other
     whole = scipy.linalg.block_diag(quarter @ covariance @ quarter.T, np.nan_to_num(sigma) ** 2)
     sigmas = sigmas_of(slopes @ whole @ slopes.T)
+    roll, pitch, yaw = (_entry(*pair, "rad") for pair in zip(angles, sigmas, strict=True))
     norm = lengths_of(force)
     scatter = _of_mean(norm[:, None])
     return {
@@ -296,9 +287,9 @@ def _mounted(
         "seconds": float(np.diff(stops.intervals).sum()),
         "up": up.tolist(),
         "forward": ahead.tolist() if determined else None,
-        "roll": _entry(angles[0], sigmas[0], "rad"),
-        "pitch": _entry(angles[1], sigmas[1], "rad"),
-        "yaw": _entry(angles[2], sigmas[2], "rad") if determined else None,
+        "roll": roll,
+        "pitch": pitch,
+        "yaw": yaw if determined else None,
         "slope": None if len(different) < 2 else float(np.sqrt(different.var(axis=0, ddof=1).sum())),
         "speeds": [
             {"stop": int(side), "along": float(along), "left": float(left)}
@@ -339,7 +330,7 @@ def _speeds(
         after = 1, stop, min(edges[number + 1], stop + _SECONDS)
         for sign, first, last in (before, after):
             rows = np.flatnonzero((time >= first) & (time < last))[::sign]
-            turned = np.abs(np.angle(course[rows] / course[rows[:1]])) > _STRAIGHT
+            turned = abs(np.angle(course[rows] / course[rows[:1]])) > _STRAIGHT
             rows = rows[: int(turned.argmax()) if turned.any() else None]
             if last - first > 1.0 and len(rows):
                 gained = (sensed[rows] - force[number]) @ across.T @ np.array([1.0, 1j])
@@ -358,12 +349,11 @@ def _forward(sides: IntArray, speeds: FloatArray) -> tuple[FloatArray, float, fl
     if not len(speeds):
         return np.array([1.0, 0.0]), np.nan, 0.0
     direction = np.linalg.svd(speeds, full_matrices=False)[2][0]
-    direction = direction * (np.sign(speeds.sum(axis=0) @ direction) or 1.0)
+    direction *= np.sign(speeds.sum(axis=0) @ direction) or 1.0
     along, across = speeds @ direction, speeds @ np.array([-direction[1], direction[0]])
-    alike = float((along * np.abs(along)).sum() / (along**2).sum())
+    alike = float((along * abs(along)).sum() / (along**2).sum())
     pulls = np.bincount(sides, along * across)[np.unique(sides)]
-    count = len(pulls)
-    if count < _FEWEST_STOPS:
+    if (count := len(pulls)) < _FEWEST_STOPS:
         return direction, np.nan, alike
     scatter = np.sqrt((pulls**2).sum() * count / (count - 1)) / (along**2).sum()
     return direction, float(scatter * student_isf(0.025, count - 1) / Z95), alike
