@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from itertools import takewhile
+from itertools import islice, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,8 @@ _PLAUSIBLE = 0.5, 8000.0
 _LIKELY = 5.0, 4000.0
 """Hz: sample rates that a log may have, stamps that mean another are in another unit; and that one with turns has."""
 _MIDDLE_RATE = 50.0  # Hz; of two rates that stamps may mean, the nearer one on a log scale is likelier
+_FIELD_IN = {"uT": 50.0, "G": 0.5, "mG": 500.0, "nT": 5e4, "T": 5e-5}  # of the Earth
+_TIME_UNITS = ("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("100 us", 1e-4)
 _DAY, _DATES = 86400.0, ((3e4, 8e4), (7.24e5, 7.74e5))
 """Seconds, and the days of the years 1982 to 2119 since 1900, as in spreadsheets, and since 0, as in MATLAB."""
 _STEADY = 0.12
@@ -129,7 +132,7 @@ class Advice:
 class _Triad:
     """Three columns of one sensor, and what is known of them."""
 
-    places: tuple[int, int, int]
+    places: Sequence[int]
     label: str
     values: FloatArray  # (n, 3), rows that are whole
     rows: np.ndarray  # their indices
@@ -235,22 +238,19 @@ class _Guess:
         self.file, self.file_not = sensor_of(tuple(words_of(Path(table.path).stem)))
 
     def _numbers(self, at: int) -> FloatArray | None:
-        try:
+        with suppress(InputError):
             values = np.asarray(self.table.numbers(at), float)
-        except InputError:
-            return None
-        return values if np.isfinite(values).sum() > 1 else None
+            return values if np.isfinite(values).sum() > 1 else None
+        return None
 
-    def _triad(self, places: tuple[int, int, int], **more) -> _Triad | None:
+    def _triad(self, places: Sequence[int], label: str = "", **more) -> _Triad | None:
         columns = [values for at in places if (values := self.numbers[at]) is not None]
         if len(columns) < 3:
             return None
         values = np.stack(columns, axis=1)
         rows = np.flatnonzero(np.isfinite(values).all(axis=1))
-        if len(rows) < 2:
-            return None
-        first, _, last = (self.table.label(at) for at in places)
-        return _Triad(places, f"{first} … {last.removeprefix('number ')}", values[rows], rows, **more)
+        label = label or f"{self.table.label(places[0])} … {self.table.label(places[2]).removeprefix('number ')}"
+        return _Triad(places, label, values[rows], rows, **more) if len(rows) > 1 else None
 
     def _off_unit(self, places: Collection[int]) -> FloatArray:
         """How far the length of the numbers in some columns is off one, by row."""
@@ -259,8 +259,9 @@ class _Guess:
     def _ask(self, text: str, blank: str = "", default: str | None = None, option: str = "columns") -> None:
         self.questions.append(OpenPoint(text, option, blank, default))
 
-    def _has(self, name: str) -> bool:
-        return any(column.name == name for column in self.chosen.values())
+    def _unit_of(self, name: str) -> str | None:
+        """The unit of the column that was chosen for a name; None without one."""
+        return next((column.unit for column in self.chosen.values() if column.name == name), None)
 
     def _looked_at(self) -> Iterable[tuple[int, Field, FloatArray | None]]:
         """The number of each column, what its name says, and its numbers."""
@@ -289,7 +290,7 @@ class _Guess:
         if accel is None and role != "gyro":
             accel = self._by_gravity(free, gyro)
         if accel is not None and gyro is None:
-            gyro = self._by_turning([triad for triad in free if not set(triad.places) & set(accel.places)], accel)
+            gyro = self._by_turning(free, accel)
         self._units(accel, gyro)
         self._others(triads)
         return self._result(accel, gyro)
@@ -303,17 +304,15 @@ class _Guess:
         if named:
             return min(named, key=lambda at: find_unit(self.fields[at].unit or "", "time") is None)
         for at, field, values in self._looked_at():
-            if values is None or field.sensor or not rises(values):
-                continue
             named = find_unit(field.unit or "", "time") or {"time", "date"} & set(field.stem) or _ends_in_time(field)
-            if not (named or _plain(field)):
-                continue  # a name that says something else: a counter, a tick, an angle
-            steps = np.diff(values)
-            usual = np.median(steps)
-            if (steps == 1.0).mean() > 0.9 or not (np.abs(steps - usual) < 0.5 * abs(usual)).mean() > 0.8:
-                continue  # a counter, or a sum of something
-            self.reasons.append(f"column {self.table.label(at)} rises steadily, by {usual:.4g} a row: time")
-            return at
+            # any other name says something else: a counter, a tick, an angle
+            if values is not None and not field.sensor and (named or _plain(field)) and rises(values):
+                steps = np.diff(values)
+                usual = np.median(steps)
+                # no counter, and no sum of something
+                if (steps == 1.0).mean() <= 0.9 and (np.abs(steps - usual) < 0.5 * abs(usual)).mean() > 0.8:
+                    self.reasons.append(f"column {self.table.label(at)} rises steadily, by {usual:.4g} a row: time")
+                    return at
         return None
 
     def _without_time(self) -> str:
@@ -326,31 +325,23 @@ class _Guess:
 
     def _carry_on(self) -> None:
         """Let the time go on where a counter starts again, whatever its end is."""
-        values = None if self.time is None else self.numbers[self.time]
-        if self.time is None or values is None:
-            return
-        steps = np.diff(values)
-        if (steps < 0).any():
-            steps = np.where(steps < 0, np.median(steps[steps > 0]), steps)
-            self.numbers[self.time] = values[0] + np.cumulative_sum(steps, include_initial=True)
+        if self.time is not None and (values := self.numbers[self.time]) is not None:
+            steps = np.diff(values)
+            if (steps < 0).any():
+                steps = np.where(steps < 0, np.median(steps[steps > 0]), steps)
+                self.numbers[self.time] = values[0] + np.cumulative_sum(steps, include_initial=True)
 
     def _named_triads(self) -> list[_Triad]:
         """The triads that names show, of whatever sensor."""
         groups: dict[tuple, dict[str, int]] = {}
-        refused: dict[tuple, dict[str, int]] = {}
         for at, field in enumerate(self.fields):
             if field.axis and field.axis in "xyz":
-                kept = refused if field.why_not else groups
-                kept.setdefault((field.stem, field.why_not or field.sensor, field.unit), {}).setdefault(field.axis, at)
-        for (stem, why, unit), axes in refused.items():
-            triad = self._triad((axes["x"], axes["y"], axes["z"]), unit=unit) if len(axes) == 3 else None
-            if triad is not None:
-                triad.label = " ".join(stem)
-                self.refused.append((triad, why))
+                group = groups.setdefault((field.stem, field.sensor, field.unit, field.why_not), {})
+                group.setdefault(field.axis, at)
         quaternions = {field.stem for field in self.fields if "w" in field.stem[-1:]}
         triads = []
-        for (stem, sensor, unit), axes in groups.items():
-            if len(axes) != 3 or (*stem, "w") in quaternions:
+        for (stem, sensor, unit, why_not), axes in groups.items():
+            if len(axes) != 3 or ((*stem, "w") in quaternions and not why_not):
                 continue
             named = sensor is not None and bool(stem)
             if sensor is None and not stem and self.file in SENSORS:
@@ -358,13 +349,15 @@ class _Guess:
             if sensor is None and not measures(unit) and not stem and self.file_not:
                 self._ask(f"Does this file hold an accelerometer? By its name it is {self.file_not}.")
                 continue
-            triad = self._triad(
-                (axes["x"], axes["y"], axes["z"]), sensor=sensor, unit=unit, plain=len(stem), named=named
-            )
-            if triad is not None:
-                triad.label = " ".join(stem) or "x, y, z"
-                triad.sensor = sensor or measures(unit, triad.level)  # Trigno x [g]: the word is unknown, the unit not
-                triads.append(triad)
+            triad = self._triad([axes[axis] for axis in "xyz"], " ".join(stem) or "x, y, z", unit=unit)
+            if triad is None:
+                continue
+            if why_not:
+                self.refused.append((triad, why_not))
+                continue
+            triad.plain, triad.named = len(stem), named
+            triad.sensor = sensor or measures(unit, triad.level)  # Trigno x [g]: the word is unknown, the unit not
+            triads.append(triad)
         return triads
 
     def _with_gravity(self) -> _Triad | None:
@@ -380,13 +373,13 @@ class _Guess:
         """Say what is there in place of an accelerometer whose gravity was taken out; empty where nothing is."""
         parts = {why: triad.label for triad, why in self.refused}
         moved, alone = parts.get("gravity is taken out"), parts.get("gravity alone")
-        if moved and alone:
+        if not moved:
+            return ""
+        if alone:
             return (
                 f"The accelerometer stands apart in {moved!r} and {alone!r}: their sum is what it measured, gravity "
                 "with it. Write a file with the sum as accel_x, accel_y, accel_z."
             )
-        if moved is None:
-            return ""
         return (
             f"By its name {moved!r} has gravity taken out, and it holds {self.refused[0][0].level:.2g} at rest; a "
             "calibration needs the accelerometer with gravity: record that in its place."
@@ -394,18 +387,18 @@ class _Guess:
 
     def _best(self, triads: list[_Triad], sensor: str) -> _Triad | None:
         """The triad that is named after a sensor; of several the one that behaves like it, told with the others."""
-        named = [triad for triad in triads if triad.sensor == sensor]
-        if not named:
-            return None
         unsure = {None: 2, "?": 1, "count": 1}
-        named.sort(
+        named = sorted(
+            (triad for triad in triads if triad.sensor == sensor),
             key=lambda one: (
                 sensor == "accel" and unsure.get(one.gravity_unit, 0),
                 one.plain,
                 "high" in one.label.split(),  # a range for impacts is coarse
                 one.places,
-            )
+            ),
         )
+        if not named:
+            return None
         first, name = named[0], GROUPS[sensor].field
         if len(named) > 1:
             others = ", ".join(repr(triad.label) for triad in named[1:])
@@ -427,27 +420,24 @@ class _Guess:
             counter = rises(values) and ((steps == 1.0).mean() > 0.9 or (steps > 0).mean() > 0.98)
             if np.ptp(finite) > 0 and not counter:
                 free.append(at)
-        quaternion: set[int] = set()
-        for at in free:
+        for at in [*free]:
             four = range(at, at + 4)
-            if set(four) <= set(free) - quaternion and self._off_unit(four).max() < _UNIT_LENGTH:
-                quaternion |= set(four)
+            if set(four) <= set(free) and self._off_unit(four).max() < _UNIT_LENGTH:
+                free = [other for other in free if other not in four]
                 self.attitude = True
                 self.reasons.append(f"columns {self.table.label(at)} and the three after it have norm 1: a quaternion")
         if self.table.names and unknown:
             return unknown
         runs: list[list[int]] = []
         for at in free:
-            if at in quaternion:
-                continue
             if runs and runs[-1][-1] == at - 1 and _alike(self.fields[at], self.fields[at - 1]):
                 runs[-1].append(at)
             else:
                 runs.append([at])
         for run in runs:
             step = 3 if len(run) % 3 == 0 else 1
-            three = ((run[k], run[k + 1], run[k + 2]) for k in range(0, len(run) - 2, step))
-            unknown = [*unknown, *filter(None, (self._triad(places, loose=step == 1) for places in three))]
+            three = (self._triad(run[first : first + 3], loose=step == 1) for first in range(0, len(run) - 2, step))
+            unknown = [*unknown, *filter(None, three)]
         return unknown
 
     def _only(self, free: list[_Triad]) -> _Triad | None:
@@ -461,38 +451,32 @@ class _Guess:
         """The one triad among the unnamed that holds 1 g at rest."""
         free = [triad for triad in free if triad.posed or not triad.loose]
         holding = [triad for triad in free if triad.gravity_unit not in (None, "count")]
-        if not holding:
-            holding = [triad for triad in free if self._increment(triad)]
-        whole = [triad for triad in free if triad.whole and ((triad.posed and triad.steady) or triad.round)]
-        sure = [  # many things have norm 1
-            triad
-            for triad in holding
-            if triad.gravity_unit != "g"
-            or (triad not in self.unknown and (len(free) > 1 or gyro or (triad.lively and not self.attitude)))
-        ]
+        holding = holding or [triad for triad in free if self._increment(triad)]
         if len(holding) > 1:
             posed = [triad for triad in holding if triad.posed]
             physical = [triad for triad in holding if triad.gravity_unit == "m/s^2"]
             holding = posed if len(posed) == 1 else physical if len(physical) == 1 and not posed else holding
-        if len(holding) == 1 and holding[0] in sure:
-            one = holding[0]
-            poses = "in all its poses" if one.posed else "at rest"
-            if one.gravity_unit:
-                self.reasons.append(
-                    f"columns {one.label} hold {one.level:.4g} {poses}, 1 g in {unit_text(one.gravity_unit)}: the "
-                    "accelerometer"
-                )
-            return one
-        if not holding and len(whole) == 1 and len(free) > 1:
-            self.reasons.append(
-                f"columns {whole[0].label} alone keep their norm in all poses, in counts: the accelerometer"
-            )
-            return whole[0]
-        candidates = holding or whole
+        candidates = holding or [
+            triad for triad in free if triad.whole and ((triad.posed and triad.steady) or triad.round)
+        ]
         if len(candidates) == 1:
-            one = candidates[0]
+            one, unit = candidates[0], candidates[0].gravity_unit or ""
+            several = len(free) > 1
+            # many things have norm 1
+            clear = one not in self.unknown and (several or gyro or (one.lively and not self.attitude))
+            if holding and (unit != "g" or clear):
+                poses = "in all its poses" if one.posed else "at rest"
+                if unit:
+                    self.reasons.append(
+                        f"columns {one.label} hold {one.level:.4g} {poses}, 1 g in {unit_text(unit)}: the accelerometer"
+                    )
+                return one
+            if several and not holding:
+                self.reasons.append(
+                    f"columns {one.label} alone keep their norm in all poses, in counts: the accelerometer"
+                )
+                return one
             one.unit = "?"
-            unit = one.gravity_unit or ""
             size = f"1 g in {unit_text(unit)}" if holding else "the same norm in all poses, in counts"
             self._ask(
                 f"Are columns {one.label} the accelerometer? They hold {size}, but a magnetometer in some unit would "
@@ -513,10 +497,10 @@ class _Guess:
 
     def _by_turning(self, free: list[_Triad], accel: _Triad) -> _Triad | None:
         """The triad whose rates turn gravity as the accelerometer says."""
-        free = [triad for triad in free if not _copies(triad, accel)]
-        fits = [(abs(fit.correlation), triad) for triad in free if (fit := self._turning(accel, triad))]
-        correlation, best = max(fits, key=lambda pair: pair[0], default=(0.0, None))
-        if best is not None and correlation > CORRELATED:
+        free = [triad for triad in free if not (set(triad.places) & set(accel.places) or _copies(triad, accel))]
+        fits = {triad: abs(fit.correlation) for triad in free if (fit := self._turning(accel, triad))}
+        best = max(fits, key=fits.__getitem__, default=None)
+        if best is not None and fits[best] > CORRELATED:
             self.reasons.append(f"columns {best.label}, integrated, {_TURN}: the gyroscope")
             return best
         unclear = [
@@ -578,42 +562,36 @@ class _Guess:
 
     def _time_units(self) -> list[tuple[str, float]]:
         """The units in which the stamps mean a plausible rate, or the stated one; by name and factor."""
-        names = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "100 us": 1e-4}
-        rates = {name: 1.0 / max(self._step() * factor, 1e-300) for name, factor in names.items()}
-        for name, factor in names.items():
-            if self.table.rate and abs(rates[name] / self.table.rate - 1) < 0.1:
-                return [(name, factor)]
-        first = np.nanmin(np.asarray(self.numbers[self.time or 0]))
-        if (
-            any(low < first < high for low, high in _DATES)
-            and _PLAUSIBLE[0] <= 1 / (self._step() * _DAY) <= _PLAUSIBLE[1]
-        ):
-            return [("d", _DAY)]
-        for name, factor in names.items():
-            if name != "100 us" and EPOCH[0] < first * factor < EPOCH[1] and 0.5 < rates[name] < 2e4:
-                return [(name, factor)]
-        if "fine" not in self.fields[self.time or 0].stem:
-            rates.pop("100 us")
-        return [(name, names[name]) for name, rate in rates.items() if _PLAUSIBLE[0] <= rate <= _PLAUSIBLE[1]]
+        low, high = _PLAUSIBLE
+        first, step = np.nanmin(np.asarray(self.numbers[self.time or 0])), self._step()
+        rates = {unit: 1.0 / max(step * unit[1], 1e-300) for unit in _TIME_UNITS}
+        stated = [unit for unit in rates if self.table.rate and abs(rates[unit] / self.table.rate - 1) < 0.1]
+        if not stated and any(start < first < end for start, end in _DATES) and low <= 1 / (step * _DAY) <= high:
+            stated = [("d", _DAY)]
+        since = [unit for unit in _TIME_UNITS[:-1] if EPOCH[0] < first * unit[1] < EPOCH[1] and 0.5 < rates[unit] < 2e4]
+        if surest := stated or since:
+            return surest[:1]
+        units = _TIME_UNITS if "fine" in self.fields[self.time or 0].stem else _TIME_UNITS[:-1]
+        return [unit for unit in units if low <= rates[unit] <= high]
 
     def _units(self, accel: _Triad | None, gyro: _Triad | None) -> None:
         if accel is not None:
             self._accel_unit(accel)
-        turned, rate = None, self._stated_rate()
+        turned, best, rate = None, None, self._stated_rate()
         if rate > FASTEST:
             self._doubt_time()
         if accel is not None and gyro is not None:
             unclear = self.time is not None and (rate < SLOWEST or self._stated_time() is None)
-            tried = []
             for factor in [factor for _, factor in self._time_units()] if unclear else [None]:
                 self.assumed = factor
-                if fit := self._turning(accel, gyro):
-                    tried.append((abs(fit.correlation), self.assumed, fit))
-            if tried:
-                correlation, self.assumed, turned = max(tried, key=lambda trial: trial[0])
-                if rate < SLOWEST and correlation > CORRELATED:
-                    self._doubt_time()
+                fit = self._turning(accel, gyro)
+                if fit and (turned is None or abs(fit.correlation) > abs(turned.correlation)):
+                    turned, best = fit, self.assumed
+            if turned:
+                self.assumed = best
         slope = abs(turned.slope) if turned and abs(turned.correlation) > CORRELATED else None
+        if slope is not None and rate < SLOWEST:
+            self._doubt_time()
         if self.time is not None:
             slope = self._time_unit(self.time, gyro, slope)
         elif not self.table.rate:
@@ -627,38 +605,37 @@ class _Guess:
         if accel.unit == "?":
             self._take(accel, "accel", None)
             return
-        unit = _fitting(accel.unit, "accel")
-        if accel.gravity_unit in _GRAVITY_IN:
+        unit, shown = _fitting(accel.unit, "accel"), accel.gravity_unit
+        if shown in _GRAVITY_IN:
             unit = self._kept(accel, unit, "acceleration", STANDARD_GRAVITY / accel.level, "hold 1 g at rest")
-        if unit is None:
-            unit = accel.gravity_unit
-            if unit == "?":
-                unit = None
-                self._ask(
-                    f"Is the accelerometer ({accel.label}) in mg, in cm/s^2, or in counts? Its norm at rest is "
-                    f"{accel.level:.5g}, near 1 g in each.",
-                    "accel [?]",
-                )
-            elif unit and unit != "count":
+        if unit is None and shown == "?":
+            self._ask(
+                f"Is the accelerometer ({accel.label}) in mg, in cm/s^2, or in counts? Its norm at rest is "
+                f"{accel.level:.5g}, near 1 g in each.",
+                "accel [?]",
+            )
+        elif unit is None and shown:
+            unit = shown
+            if unit != "count":
                 self.reasons.append(
                     f"the accelerometer holds {accel.level:.4g} at rest, which is 1 g in {unit_text(unit)}"
                 )
-            elif unit is None:
-                counts = accel.whole and np.abs(accel.values).max() > 200
-                unit = "count" if counts else "m/s" if self._increment(accel) else None
-                if unit is None:
-                    self._ask(
-                        f"In which unit is the accelerometer ({accel.label})? Its norm at rest is {accel.level:.4g}, "
-                        "1 g in none that is known; is it an accelerometer?",
-                        "accel [?]",
-                    )
+        elif unit is None:
+            counts = accel.whole and np.abs(accel.values).max() > 200
+            unit = "count" if counts else "m/s" if self._increment(accel) else None
+            if unit is None:
+                self._ask(
+                    f"In which unit is the accelerometer ({accel.label})? Its norm at rest is {accel.level:.4g}, "
+                    "1 g in none that is known; is it an accelerometer?",
+                    "accel [?]",
+                )
         if unit == "count" and not accel.round:
-            near = min(_PER_G, key=lambda scale: abs(math.log(accel.level / scale))) if accel.level > 0 else 0
-            if near and accel.steady and abs(accel.level / near - 1) < 0.08:
+            near = min(_PER_G, key=lambda scale: abs(accel.level / scale - 1))
+            self.accel_scale = "?"
+            if accel.steady and abs(accel.level / near - 1) < 0.08:
                 self.accel_scale = f"{near} count/g"
                 self.reasons.append(f"the accelerometer holds {accel.level:.5g} counts at rest: {near} to 1 g")
             else:
-                self.accel_scale = "?"
                 self._ask(
                     f"How many counts are 1 g (--accel-scale)? The accelerometer's norm at rest is {accel.level:.5g}.",
                     "?",
@@ -669,10 +646,10 @@ class _Guess:
     def _kept(self, triad: _Triad, unit: str | None, quantity: str, factor: float | None, does: str) -> str | None:
         """The unit that is stated, None where the values show another one, of which `factor` is about one in SI."""
         stated = find_unit(unit or "", quantity)
-        if stated is None or factor is None or abs(math.log(factor / stated.factor)) < _ANOTHER:
-            return unit
-        self.reasons.append(f"{triad.label!r} is in {unit} by its name, in which it does not {does}")
-        return None
+        if stated and factor and abs(math.log(factor / stated.factor)) >= _ANOTHER:
+            self.reasons.append(f"{triad.label!r} is in {unit} by its name, in which it does not {does}")
+            return None
+        return unit
 
     def _increment(self, accel: _Triad) -> bool:
         """Whether the triad is g times the sampling interval: velocity increments."""
@@ -695,18 +672,18 @@ class _Guess:
             stated = find_unit(gyro.unit or "", "angular rate")
             angles = [stated.factor] if stated else [_ANGLES["rad/s"], _ANGLES["deg/s"]]
             raw = slope * self._factor()
-            fits = [option for option in options for angle in angles if abs(math.log(raw / option[1] / angle)) < 0.25]
-            if len(set(fits)) == 1:
-                slope, options = raw / fits[0][1], fits[:1]
-                self.reasons.append(f"with stamps in {fits[0][0]} the integrated rates {_TURN}")
-        if len(options) == 1:
-            unit, factor = options[0]
-            source = ", as the file states" if self.table.rate else ""
-            self.reasons.append(f"{label} rises by {step:.5g} a row, {1.0 / (step * factor):.4g} Hz in {unit}{source}")
-            self.chosen[time] = Column(TIME, unit)
-            return slope
-        rates = {unit: 1 / (step * factor) for unit, factor in options}
+            fits = {option for option in options for angle in angles if abs(math.log(raw / option[1] / angle)) < 0.25}
+            if len(fits) == 1:
+                options = [*fits]
+                slope = raw / options[0][1]
+                self.reasons.append(f"with stamps in {options[0][0]} the integrated rates {_TURN}")
+        rates = {unit: 1.0 / (step * factor) for unit, factor in options}
         shown = ", ".join(f"{rate:.4g} Hz in {unit}" for unit, rate in rates.items())
+        if len(options) == 1:
+            source = ", as the file states" if self.table.rate else ""
+            self.reasons.append(f"{label} rises by {step:.5g} a row, {shown}{source}")
+            self.chosen[time] = Column(TIME, *rates)
+            return slope
         meaning = f": {shown}" if rates else ", a rate of no IMU in any unit; is it a counter?"
         likely = min(rates, key=lambda unit: abs(math.log(rates[unit] / _MIDDLE_RATE)), default=None)
         self._ask(f"In which unit is {label}? It rises by {step:.5g} a row{meaning}.", "time [?]", likely)
@@ -719,12 +696,11 @@ class _Guess:
         peak = np.abs(gyro.values).max()
         rest = np.abs(np.median(gyro.values, axis=0)).max()
         resting = accel is not None and accel.still and not accel.posed and not gyro.turns
-        accel_unit = next((column.unit for column in self.chosen.values() if column.name == "accel_x"), None)
+        accel_unit = self._unit_of("accel_x")
         if unit is None and slope is not None:
             best, off = likeliest(slope, _ANGLES)
-            close = 0.25
-            if gyro.whole:  # counts may be anything: 16.4 to 1 deg/s are 1.06 mrad/s
-                close = 0.1 if best in ("rad/s", "deg/s") else 0.025
+            # counts may be anything: 16.4 to 1 deg/s are 1.06 mrad/s
+            close = 0.25 if not gyro.whole else 0.1 if best in ("rad/s", "deg/s") else 0.025
             if accel_unit == "m/s":
                 unit = self._angle_increment(slope)
             elif off < close:
@@ -797,20 +773,17 @@ class _Guess:
     def _others(self, triads: list[_Triad]) -> None:
         """Magnetometer and temperature, where name and unit are clear; what is not clear is left out."""
         for triad in triads:
-            if triad.sensor == "mag" and not self._has("mag_x"):
-                unit = _fitting(triad.unit, "mag")
-                sizes = {"uT": 50.0, "G": 0.5, "mG": 500.0, "nT": 5e4, "T": 5e-5}
-                unit = unit or next((name for name, size in sizes.items() if 0.5 < triad.level / size < 1.4), None)
-                if triad.whole and not triad.unit:
-                    unit = "count"
-                if unit:
-                    self._take(triad, "mag", unit)
+            if triad.sensor == "mag" and not self._unit_of("mag_x"):
+                fitting = [name for name, size in _FIELD_IN.items() if 0.5 < triad.level / size < 1.4]
+                unit = "count" if triad.whole and not triad.unit else _fitting(triad.unit, "mag")
+                if units := [unit] if unit else fitting:
+                    self._take(triad, "mag", units[0])
         self._quaternion()
         for at, field, values in self._looked_at():
             name = field.sensor or ""
             if name.startswith("attitude_"):
                 self.chosen[at] = Column(name, field.unit)
-            if name not in _SINGLE or values is None or self._has(name):
+            if name not in _SINGLE or values is None or self._unit_of(name):
                 continue
             unit = _fitting(field.unit, name)
             if unit is None and "temperature" in name:
@@ -837,16 +810,13 @@ class _Guess:
         """An attitude by name, whose four numbers have norm 1."""
         named: dict[str, dict[str, int]] = {}
         for at, name in enumerate(self.table.header):
-            if match := re.fullmatch(r"(.*?)[\W_]*([wxyz])", parse_column(name)[0].strip().lower()):
+            match = re.fullmatch(r"(.*?)[\W_]*([wxyz])", parse_column(name)[0].strip().lower())
+            if match and self.numbers[at] is not None and set(words_of(match[1])) & _ATTITUDES:
                 named.setdefault(match[1], {})[match[2]] = at
         for head, places in named.items():
-            missing = any(self.numbers[at] is None for at in places.values())
-            if len(places) < 4 or missing or not set(words_of(head)) & _ATTITUDES:
-                continue
-            if np.nanmax(self._off_unit(places.values())) < _UNIT_LENGTH:
+            if len(places) == 4 and np.nanmax(self._off_unit(places.values())) < _UNIT_LENGTH:
                 self.reasons.append(f"{head!r} is a quaternion of norm 1: an attitude")
-                for axis, at in places.items():
-                    self.chosen[at] = Column(f"attitude_{axis}")
+                self.chosen |= {at: Column(f"attitude_{axis}") for axis, at in places.items()}
                 return
 
     # --- the result
@@ -867,6 +837,21 @@ class _Guess:
             magnetometer=text,
         )
 
+    def _without_triad(self) -> str:
+        """What a table without accelerometer and gyroscope is."""
+        text = self.questions[0].text
+        if self.attitude or any(why == "an estimated bias" for _, why in self.refused):
+            text = (
+                "This is a trajectory (attitude, and position or biases beside it), no sensor's log: give it as "
+                f"--reference {self.table.path} to `jaximu reference` with the log of the same motion."
+            )
+        if self.table.names is None and self.width == len("xyz") + (self.time is not None):
+            text += (
+                f" If they are a magnetometer's, jaximu magnetometer {self.table.path} --columns calibrates it, "
+                "with its columns named (mag [uT], or mag [count])."
+            )
+        return text
+
     def _result(self, accel: _Triad | None, gyro: _Triad | None) -> Advice:
         if accel is None and self.role != "gyro":
             if sentence := self._without_gravity():
@@ -878,29 +863,14 @@ class _Guess:
         elif gyro is None and self.role == "gyro":
             self._ask("Which columns are the gyroscope?")
         if accel is None and gyro is None:
-            if self._has("mag_x"):
+            if self._unit_of("mag_x"):
                 return self._lone_magnetometer()
-            text = self.questions[0].text
-            if self.attitude or any(why == "an estimated bias" for _, why in self.refused):
-                text = (
-                    "This is a trajectory (attitude, and position or biases beside it), no sensor's log: give it as "
-                    f"--reference {self.table.path} to `jaximu reference` with the log of the same motion."
-                )
-            if self.table.names is None and self.width == len("xyz") + (self.time is not None):
-                text += (
-                    f" If they are a magnetometer's, jaximu magnetometer {self.table.path} --columns calibrates it, "
-                    "with its columns named (mag [uT], or mag [count])."
-                )
-            return Advice(reasons=tuple(self.reasons), questions=(OpenPoint(text),))
-        stated = header_columns(self.table)
-        same = stated is not None and all(
-            chosen == named if chosen.name else not named.name
-            for chosen, named in zip(self.columns, stated, strict=True)
-        )
+            return Advice(reasons=tuple(self.reasons), questions=(OpenPoint(self._without_triad()),))
+        stated = [column if column.name else Column(None) for column in header_columns(self.table) or ()]
+        same = self.columns == stated
         order = sorted(self.chosen)
         rows = [tuple(column_text([self.chosen[at]]) for at in order)]
-        for row in range(min(_SHOWN, len(self.table.columns[0]))):
-            cells = [self.table.columns[at][row] for at in order]
+        for cells in islice(zip(*(self.table.columns[at] for at in order), strict=True), _SHOWN):
             rows.append(tuple(f"{cell:.6g}" if isinstance(cell, float | np.floating) else str(cell) for cell in cells))
         return Advice(
             None if same else column_text(self.columns),
