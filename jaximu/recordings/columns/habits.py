@@ -95,15 +95,14 @@ _UNIT_WORDS = {
 }
 _GLUED = re.compile(
     r"(a|ac|acc|accel|accl|acceleration|accelerometer|g|gy|gyr|gyro|gyroscope|gf|w|om|omega|rot|rotation|m|mag|b|f|fb|wb)"
-    r"([xyz])"
+    r"([xyz])|([xyz])(a|acc|accel|acceleration|gyro|gyr|rate|rot|rotation|mag|magn)|"
+    r"(roll|pitch|yaw)(?:rate|speed)"
 )
-_LEADING = re.compile(r"([xyz])(a|acc|accel|acceleration|gyro|gyr|rate|rot|rotation|mag|magn)")
 _WITH, _WITHOUT = {"with", "including", "incl"}, {"without", "no", "excluding", "excl", "minus"}
 """Words before gravity."""
 _BROWSER = {"beta": "x", "gamma": "y", "alpha": "z"}
 """Axes of the rotation rate in a browser's DeviceMotion."""
 _TURNS = {"roll": "x", "pitch": "y", "yaw": "z"}
-_TURN_RATE = re.compile(r"(roll|pitch|yaw)(?:rate|speed)")
 _INSTANCE = re.compile(r"([a-z]+)\d+")
 _ABOUT = 0.15  # of 1 g, that an accelerometer at rest may be off
 _FIELD = 15.0, 80.0  # uT of the Earth's field, disturbed indoors
@@ -175,39 +174,35 @@ class Field:
         plain = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")
         if match := _OWN.fullmatch(plain):
             return cls((plain,), None, match[1], unit)
-        words = [word for word in words_of(text) if word != "axis"]
+        words, times = [word for word in words_of(text) if word != "axis"], _UNIT_WORDS["time"]
         stem, axis = _axis(words)
         sensor, why_not = sensor_of(stem)
         if sensor is None and why_not is None:
             for size in (3, 2, 1):  # a unit at the end of the name, whose axis stands before it
                 head, tail = words[:-size], " ".join(words[-size:])
-                if not head or not any(tail in table for table in _UNIT_WORDS.values()):
-                    continue
-                if _time(head) and tail in _UNIT_WORDS["time"]:
-                    return cls(tuple(head), None, "time", unit or _UNIT_WORDS["time"][tail])
+                if _time(head) and tail in times:
+                    return cls(tuple(head), None, "time", unit or times[tail])
                 short, at = _axis(head)
-                short_sensor, reason = sensor_of(short)
-                if tail in _UNIT_WORDS.get(short_sensor or "", {}) and (at or short_sensor == "temperature"):
-                    return cls(short, at, short_sensor, unit or _UNIT_WORDS[short_sensor or ""][tail], reason)
-        if axis is None and _time(words, unit):
-            tail = next((word for word in reversed(words) if word in _UNIT_WORDS["time"] and len(word) > 1), None)
-            stated = find_unit(unit or "", "temperature") if words == ["t"] else None
-            if stated is None:
-                return cls(tuple(words), None, "time", unit or _UNIT_WORDS["time"].get(tail or ""))
-            return cls(tuple(words), None, "temperature", unit)  # T (°)
-        if axis is None and len(words) == 1 and words[0] in _TIME_ALONE:
-            return cls(tuple(words), None, "time", unit or _UNIT_WORDS["time"].get(words[0]))
+                short_sensor, _ = sensor_of(short)
+                named = _UNIT_WORDS.get(short_sensor or "", {}).get(tail)
+                if named and (at or short_sensor == "temperature"):
+                    return cls(short, at, short_sensor, unit or named)
+        if axis is None and (_time(words, unit) or (len(words) == 1 and words[0] in _TIME_ALONE)):
+            if words == ["t"] and find_unit(unit or "", "temperature"):
+                return cls(("t",), None, "temperature", unit)  # T (°)
+            tail = next((word for word in reversed(words) if word in times and len(word) > 1), "")
+            return cls(tuple(words), None, "time", unit or times.get(tail))
         measured = find_unit(unit or "") if axis else None
-        if measured and not stem and axis in tuple("xyz"):  # X (m/s^2)
-            sensor = measures(unit)
         if not stem and measured and measured.quantity == "time":  # X [s], the abscissa
             return cls((), None, "time", unit)
-        if axis and sensor in ("temperature", "ambient_temperature"):
-            sensor = None
-        if axis and sensor == "gyro" and "g" in stem and find_unit(unit or "", "acceleration"):
-            sensor = None  # LowG_X (g): the letter is the unit's
-        if stem[:2] in _ESTIMATED and axis:
+        if not stem and axis in tuple("xyz"):  # X (m/s^2)
+            sensor = measures(unit)
+        if axis and stem[:2] in _ESTIMATED:
             sensor, why_not = None, "an estimated bias"
+        # LowG_X (g): the letter is the unit's
+        of_unit = sensor == "gyro" and "g" in stem and find_unit(unit or "", "acceleration")
+        if axis and (of_unit or "temperature" in (sensor or "")):
+            sensor = None
         return cls(stem, axis, sensor, unit, why_not)
 
 
@@ -221,24 +216,23 @@ def fields_of(names: Sequence[str]) -> list[Field]:
     for at, field in enumerate(fields):
         if field.axis is None and field.sensor is None and field.stem and field.stem[-1][-1] in "xyz":
             lettered.setdefault(" ".join(field.stem)[:-1], {})[field.stem[-1][-1]] = at
+    joined = {" ".join(field.stem) for field in fields}
     for head, places in lettered.items():
         if head and len(places) == 3:
             stem = tuple(head.split())
             sensor, why_not = sensor_of(stem)
-            if any(" ".join(field.stem) == f"{head}w" for field in fields):
-                why_not = "a quaternion"
+            why_not = "a quaternion" if f"{head}w" in joined else why_not
             for axis, at in places.items():
                 fields[at] = replace(fields[at], stem=stem, axis=axis, sensor=sensor, why_not=why_not)
     counted: dict[tuple[str, ...], dict[str, int]] = {}
     for at, field in enumerate(fields):
         if field.axis and field.axis.isdigit() and field.sensor:
             counted.setdefault(field.stem, {})[field.axis] = at
-    rates = {field.stem[0]: at for at, field in enumerate(fields) if len(field.stem) == 1 and field.stem[0] in "pqr"}
-    counted["p", "q", "r"] = {str("pqr".index(name)): at for name, at in rates.items()}
+        elif len(field.stem) == 1 and field.stem[0] in "pqr":
+            counted.setdefault(("p", "q", "r"), {})[str("pqr".index(field.stem[0]))] = at
     for places in counted.values():
         if sorted(places) in (["0", "1", "2"], ["1", "2", "3"]):
-            for axis, number in zip("xyz", sorted(places), strict=True):
-                at = places[number]
+            for axis, (_, at) in zip("xyz", sorted(places.items()), strict=True):
                 stem = fields[at].stem if fields[at].sensor else ("p", "q", "r")
                 fields[at] = replace(fields[at], stem=stem, axis=axis, sensor=fields[at].sensor or "gyro", why_not=None)
     return fields
@@ -277,22 +271,17 @@ def _in_place(words: Sequence[str], at: int, *others: str) -> tuple[str, ...]:
 
 def _axis(words: list[str]) -> tuple[tuple[str, ...], str | None]:
     """The words without the axis among them, and the axis."""
-    letters = [at for at, word in enumerate(words) if word in ("x", "y", "z")]
-    turns = [at for at, word in enumerate(words) if word in _TURNS]
     if len(words) > 1 and words[-1] in _BROWSER and words[-2] in ("rate", "rotation"):
         return tuple(words[:-1]), _BROWSER[words[-1]]
     of_sensor = len(words) > 1 and any(word in _WORDS or word in _HELPERS for word in words)
-    for places in (letters, turns if of_sensor else []):
+    for axes in ({axis: axis for axis in "xyz"}, _TURNS if of_sensor else {}):
+        places = [at for at, word in enumerate(words) if word in axes]
         if len(places) == 1:
-            word = words[places[0]]
-            return _in_place(words, places[0]), _TURNS.get(word, word)
+            return _in_place(words, places[0]), axes[words[places[0]]]
     for at, word in enumerate(words):
         if match := _GLUED.fullmatch(word):
-            return _in_place(words, at, match[1]), match[2]
-        if match := _LEADING.fullmatch(word):
-            return _in_place(words, at, match[2]), match[1]
-        if match := _TURN_RATE.fullmatch(word):
-            return _in_place(words, at, "rate"), _TURNS[match[1]]
+            sensor, axis = match[1] or match[4] or "rate", match[2] or match[3] or _TURNS[match[5]]
+            return _in_place(words, at, sensor), axis
     if words and words[-1] in ("0", "1", "2", "3"):
         return tuple(words[:-1]), words[-1]
     return tuple(words), None

@@ -88,7 +88,6 @@ JOINED = "whole time [ns]"
 _LATEST = 2**33  # s
 _PARTS = {"ms": 10**3, "us": 10**6, "ns": 10**9}
 _GAPS = 0.1  # of the seconds may begin with a row whose rest does not fall, as after a gap
-_SENSOR_LOGGER = {"time": "time [ns]", "seconds_elapsed": "", "x": "", "y": "", "z": ""}
 
 
 def known_names(table: LogTable) -> _Named | None:
@@ -102,27 +101,27 @@ def known_names(table: LogTable) -> _Named | None:
     prefixes = {match[0] for name in names if (match := re.match(r".*\.(?=fb_x$)", name))}
     if len(prefixes) == 1:  # the structure that holds them all
         names = [name.removeprefix(*prefixes) for name in names]
-    layout = next((layout for layout in _LAYOUTS if layout.needed <= set(names)), None)
-    if layout is None and (ours := _of_message(table, table.names)):
+    layouts = [layout for layout in _LAYOUTS if layout.needed <= set(names)]
+    if not layouts and (ours := _of_message(table, table.names)):
         return ours
-    if layout is None and set(_SENSOR_LOGGER) == set(names):  # one file a sensor, named after it
-        file = PurePath(table.path).name.lower()
-        if "gyro" in file or "accel" in file:
-            title = "gyro_{} [rad/s]" if "gyro" in file else "accel_{} [m/s^2]"
-            columns = _SENSOR_LOGGER | {axis: title.format(axis) for axis in "xyz"}
-            layout = _KnownLayout(f"Sensor Logger (ns, rad/s, m/s^2; {file})", columns)
-    if layout is None and "accelerometeraccelerationx" in names:
+    file = PurePath(table.path).name.lower()
+    if set(names) == {"time", "seconds_elapsed", "x", "y", "z"} and ("gyro" in file or "accel" in file):
+        title = "gyro_* [rad/s]" if "gyro" in file else "accel_* [m/s^2]"  # one file a sensor, named after it
+        columns = f"time=time [ns], seconds_elapsed=, *={title}"
+        layouts = [_KnownLayout.of(f"Sensor Logger (ns, rad/s, m/s^2; {file})", columns)]
+    if not layouts and "accelerometeraccelerationx" in names:
         return table.names, (
             "names as SensorLog for iOS has them: Apple's accelerometer reads -1 g on the axis that points up; add "
             '--axes "-f" to have specific force.'
         )
-    if layout is None:
+    if not layouts:
         return None
+    titles = layouts[0].columns
     ours = tuple(
-        own_name if (title := layout.columns.get(name)) is None else _titled(title, own_name)
-        for name, own_name in zip(names, table.names, strict=True)
+        _titled(titles[name], original) if name in titles else original
+        for name, original in zip(names, table.names, strict=True)
     )
-    return ours, f"columns and units as {layout.program} has them."
+    return ours, f"columns and units as {layouts[0].program} has them."
 
 
 _TRIADS = (("mag", "G"), ("accel", "m/s^2"), ("gyro", "rad/s"))
@@ -161,8 +160,8 @@ def _of_message(table: LogTable, names: tuple[str, ...]) -> _Named | None:
 
 def sentence_names(name: str, count: int) -> list[str] | None:
     """The names of the values after a VectorNav sentence's own name, None for another sentence or number of them."""
-    names = _SENTENCES.get(name)
-    return list(names[1:]) if names is not None and len(names) == count + 1 else None
+    names = _SENTENCES.get(name, ())[1:]
+    return [*names] if len(names) == count else None
 
 
 def _without_header(table: LogTable) -> _Named | None:
@@ -189,7 +188,7 @@ def _titled(title: str, name: str) -> str:
     """A program's title for a column, in the unit that the column's own name states where that is one of its kind."""
     (plain, usual), (_, stated) = parse_column(title), parse_column(name)
     unit = find_unit(usual or "")
-    return column_title(plain, stated) if unit and stated and find_unit(stated, unit.quantity) else title
+    return column_title(plain, stated) if unit and find_unit(stated or "", unit.quantity) else title
 
 
 def whole_stamps(table: LogTable) -> LogTable:
