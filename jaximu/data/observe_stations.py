@@ -30,7 +30,7 @@ from jaximu.recordings.entry import ScheduleEntry, times_of
 from jaximu.recordings.observations import POWER_ON, Stations
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.reference import Integral, match_reference, means_over, rest_rate
-from jaximu.recordings.segmentation import noise_by_model, require_model, rest_statistics
+from jaximu.recordings.segmentation import noise_by_model, rest_statistics
 from jaximu.simulation.protocols import Environment, Protocol, attitude_of
 from jaximu.simulation.protocols.motion import smooth_course
 
@@ -164,7 +164,7 @@ def _known_covariance(
     """Covariance (3, n, n) of means by a noise model; slow noise ties those of one recording, `together` (n, n)."""
     if not len(signal):
         return np.zeros((3, len(span), len(span)))
-    white, slow = noise_by_model(signal, require_model(signal, noise, name), span[:, 0], span[:, 1], together)
+    white, slow = noise_by_model(signal, noise, name, span[:, 0], span[:, 1], together)
     return slow + (np.diag(white)[:, None] / np.diff(span)[:, 0])[:, :, None] * np.eye(len(span))
 
 

@@ -110,12 +110,13 @@ def _floor(variance: FloatArray, moments: Moments) -> float:
 
 
 def _angles(vectors: FloatArray, others: FloatArray) -> FloatArray:
-    """Angle (rad) between each vector and the other of its row."""
+    """Angle (rad) between each vector and the other of its row, or one for all."""
     return 2 * np.arcsin((lengths_of(unit_vectors(others) - unit_vectors(vectors)) / 2).clip(0, 1))
 
 
-def _samples(signal: Signal, start: float, stop: float) -> slice:
-    return slice(np.searchsorted(signal.time, start), np.searchsorted(signal.time, stop))
+def _samples(signal: Signal, intervals: FloatArray) -> list[FloatArray]:
+    """The samples (3, n) of each interval."""
+    return [signal.values[first:last].T for first, last in signal.time.searchsorted(intervals)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +137,7 @@ class _Scan:
     @classmethod
     def of(cls, recording: Recording, window: float) -> "_Scan":
         """Scan a recording by windows of so many seconds or a little more. Raises `NotPossibleError` if it is short."""
-        signals = [recording.accelerometer, *([] if recording.gyroscope is None else [recording.gyroscope])]
+        signals = [signal for signal in (recording.accelerometer, recording.gyroscope) if signal is not None]
         # A slow logger needs a longer window to hold enough samples for a variance.
         width = max(window, 10 / min(signal.rate for signal in signals))
         start = max(signal.time[0] for signal in signals) + width / 2
@@ -169,7 +170,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     """
     options = options or SegmentationOptions()
     gyroscope, scan = recording.gyroscope, _Scan.of(recording, options.window)
-    width, centres, moments, means, ratio = scan.width, scan.centres, scan.moments, scan.means, scan.ratio
+    width, centres, means, ratio = scan.width, scan.centres, scan.means, scan.ratio
     turning = np.zeros(len(centres)) if gyroscope is None else _turning(means[1], ratio, options.rate_limit)
     sums = np.cumulative_sum(means[0], axis=0, include_initial=True)
 
@@ -198,7 +199,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     score = np.array([distinct - 0.5 * (count - distinct) for _, count, distinct, _ in tried])
     best = score.max()  # negative where the same few orientations come back again and again
     chosen = int(np.flatnonzero(score >= best - 0.05 * abs(best))[0])
-    intervals, notes = _drop_rotating(moments, results[chosen][0])
+    intervals, notes = _drop_rotating(scan.moments, results[chosen][0])
     if len(intervals) < options.fewest:
         raise NotPossibleError(
             f"{recording.name}: {_why_no_poses(results[chosen][0], centres[-1] - centres[0], means[0], notes)}"
@@ -215,7 +216,7 @@ def find_stops(recording: Recording) -> Segmentation | None:
     """
     scan = _Scan.of(recording, _STOP_WINDOW)
     force = scan.means[0]
-    turned = (_angles(force, np.broadcast_to(np.median(force, axis=0), force.shape)) > _UPRIGHT).mean()
+    turned = (_angles(force, np.median(force, axis=0)) > _UPRIGHT).mean()
     limits = (_STEADY, SegmentationOptions.rate_limit)  # of force and rate; beyond either the unit moves
     off = [lengths_of(mean - np.median(mean, axis=0)) for mean in scan.means]
     moving = np.mean([values > limit for values, limit in zip(off, limits, strict=False)], axis=1).max()
@@ -255,8 +256,7 @@ def _why_no_poses(intervals: FloatArray, duration: float, force: FloatArray, not
         "A calibration needs at least nine orientations: hold the unit still for two seconds or more in each, and turn "
         "it between them."
     )
-    alternating = np.insert(force, np.arange(1, len(force)), np.median(force, axis=0), axis=0)
-    off = _angles(alternating[:-1], alternating[1:]) if len(force) > 1 else np.zeros(1)
+    off = _angles(force, np.median(force, axis=0))
     if np.quantile(off, 0.99) < _DISTINCT and np.diff(intervals).sum() > 0.5 * duration:
         return (
             "1 static pose found: the unit lay in one orientation throughout. That shows its noise (jaximu allan) and, "
@@ -318,7 +318,7 @@ def rest_statistics(
     a low-pass filter or a vibration adds to neighbouring samples. An interval noisier than the others by half or more
     gets its own share. Steps coarser than the noise shift means, those of a gyroscope (`turning`) all alike.
     """
-    columns = [signal.values[_samples(signal, start, stop)].T for start, stop in intervals]
+    columns = _samples(signal, intervals)
     counts = np.array([column.shape[1] for column in columns])
     first = counts.cumsum() - counts
     values = np.concatenate(columns, axis=1)
@@ -351,10 +351,7 @@ def _without_sway(signal: Signal, columns: Sequence[FloatArray], density: FloatA
         return density, np.zeros((3, 3))
     (first, _), (quarter, _), (half, freedom) = (_of_blocks(signal, columns, n) for n in (shortest, size, 2 * size))
     chance = np.sqrt(2 / (3 * max(freedom, 1)))
-    before, longer = (
-        float((np.diagonal(part) / np.maximum(np.diagonal(half), 1e-300)).mean())  # noise-free: no scatter
-        for part in (first, quarter)
-    )
+    before, longer = (_density_ratio(part, half) for part in (first, quarter))
     if not freedom or before * (1 - _CHANCE * chance) < 1:
         return density, np.zeros((3, 3))
     sway = min(max(longer - 1, 0.0), (1 - chance) / 1.5)  # of the halves' density, 1 = white + 3/2 sway
@@ -369,8 +366,8 @@ def _across_gravity(signal: Signal, intervals: FloatArray, force: FloatArray, co
     """
     up = unit_vectors((force - signal.nominal_offset) / signal.nominal_scale)
     onto = (signal.nominal_scale * up)[:, :, None] * (up / signal.nominal_scale)[:, None]
-    columns = [signal.values[_samples(signal, start, stop)].T for start, stop in intervals]
-    along, freedom = _density(signal, [part @ column for part, column in zip(onto, columns, strict=True)])
+    columns = [part @ column for part, column in zip(onto, _samples(signal, intervals), strict=True)]
+    along, freedom = _density(signal, columns)
     expected = (onto @ covariance @ onto.mT * np.diff(intervals)[:, :, None]).mean(axis=0)
     scattered, stated = ((np.diagonal(part) / signal.nominal_scale**2).sum() for part in (along, expected))
     share = float(scattered / stated)
@@ -391,10 +388,14 @@ def _density(signal: Signal, columns: Sequence[FloatArray]) -> tuple[FloatArray,
     best = _of_blocks(signal, columns, size)
     for factor in (2, 4):
         longer, freedom = _of_blocks(signal, columns, factor * size)
-        ratio = (np.diagonal(longer) / np.maximum(np.diagonal(best[0]), 1e-300)).mean()  # noise-free: no scatter
-        if freedom and ratio < 1 - _CHANCE * np.sqrt(2 / (3 * freedom)):
+        if freedom and _density_ratio(longer, best[0]) < 1 - _CHANCE * np.sqrt(2 / (3 * freedom)):
             best = longer, freedom
     return best
+
+
+def _density_ratio(density: FloatArray, other: FloatArray) -> float:
+    """How many times a density (3, 3) is another one, over the axes; one without noise has no scatter."""
+    return float((np.diagonal(density) / np.maximum(np.diagonal(other), 1e-300)).mean())
 
 
 def _of_blocks(signal: Signal, columns: Sequence[FloatArray], size: int) -> tuple[FloatArray, int]:
@@ -430,25 +431,22 @@ def _rounding_of_means(signal: Signal, variances: FloatArray) -> FloatArray:
     return rounding * np.minimum(1.0, 6 / np.pi**2 * np.exp(-(np.pi**2) / 3 * quiet))
 
 
-def require_model(signal: Signal, noise: AxisNoise | None, name: str) -> AxisNoise:
+def noise_by_model(
+    signal: Signal, noise: AxisNoise | None, name: str, start: FloatArray, stop: FloatArray, same: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """White density (3, 3) and covariance (3, n, n) of slow bias over intervals, in output units; `same` (n, n) tells
+    which intervals belong to one recording: between power-ons nothing is carried over.
+
+    Raises `InputError` where the model lacks the sensor called `name`, or was made in other units.
+    """
     if noise is None:
         raise InputError(f"the recording at rest has no {name}, but the one to calibrate has one.")
-    quantum = np.sqrt(signal.rounding_variance)
     sigma = np.sqrt(np.median(noise.covariance([0.0], [1.0])) * signal.rate)
-    if sigma < 1e-3 * quantum:
+    if sigma < 1e-3 * np.sqrt(signal.rounding_variance):
         raise InputError(
             f"the recording at rest has a {name} noise of {sigma:.2g} SI units a sample, a thousandth of the step to "
             "which the other recording is rounded: one of the two is in other units than it says."
         )
-    return noise
-
-
-def noise_by_model(
-    signal: Signal, noise: AxisNoise, start: FloatArray, stop: FloatArray, same: BoolArray
-) -> tuple[FloatArray, FloatArray]:
-    """White density (3, 3) and covariance (3, n, n) of slow bias over intervals, in output units; `same` (n, n) tells
-    which intervals belong to one recording: between power-ons nothing is carried over.
-    """
     white, slow = noise.split(_SHORTEST)
     scale = np.square(signal.nominal_scale)
     return np.diag(white * scale), slow.covariance(start, stop) * scale[:, None, None] * same
@@ -474,15 +472,12 @@ def observed_poses(
     """
     parts = [segmentations] if isinstance(segmentations, Segmentation) else list(segmentations)
     rests: list[dict[str, FloatArray]] = []
-    spans: list[FloatArray] = []  # start and stop of the turn after each pose
-    turns = []
-    densities = []
+    turns, densities = [], []
     first_rest: FloatArray | None = None
     for part in parts:
         recording, intervals = part.recording, part.intervals
         accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
         _, force, force_covariance = rest_statistics(accelerometer, intervals)
-        force_covariance = _across_gravity(accelerometer, intervals, force, force_covariance)
         density, rate, rate_covariance = np.eye(3), *_no_means(len(intervals))
         between = [_NO_TURN] * (len(intervals) - 1)
         if gyroscope is not None:
@@ -495,7 +490,7 @@ def observed_poses(
         rests.append(
             {
                 "accelerometer_mean": force,
-                "accelerometer_covariance": force_covariance,
+                "accelerometer_covariance": _across_gravity(accelerometer, intervals, force, force_covariance),
                 "gyroscope_mean": rate,
                 "gyroscope_covariance": rate_covariance,
                 "start": intervals[:, 0],
@@ -506,12 +501,10 @@ def observed_poses(
         )
         densities.append(density)
         turns += [*between, _NO_TURN]  # from the recording's end to the start of the next one
-        spans += [np.stack([intervals[:-1, 1], intervals[1:, 0]], axis=1), intervals[-1:, ::-1]]
     columns = {name: np.concatenate([rest[name] for rest in rests]) for name in rests[0]}
     offset = parts[0].recording.accelerometer.nominal_offset
-    density = np.mean(densities, axis=0)
-    observations = _padded(columns, turns[:-1], density, offset, gravity, bucket)
-    return observations if noise is None else _with_noise(observations, parts, noise, np.concatenate(spans)[:-1])
+    observations = _padded(columns, turns[:-1], np.mean(densities, axis=0), offset, gravity, bucket)
+    return observations if noise is None else _with_noise(observations, parts, noise)
 
 
 def _no_means(count: int) -> tuple[FloatArray, FloatArray]:
@@ -556,10 +549,8 @@ def _padded(
     longest = max((len(interval) for _, interval in turns), default=1)
     padded, samples = bucket or (padded_size(poses), padded_size(longest, 16))
     output, interval = np.zeros((padded - 1, samples, 3)), np.zeros((padded - 1, samples))
-    used = np.zeros(padded - 1, bool)
     for index, (values, durations) in enumerate(turns):
         output[index, : len(values)], interval[index, : len(values)] = values, durations
-        used[index] = len(values) > 0
     up = np.array([0.0, 0.0, gravity])
     fills = {
         "accelerometer_mean": offset + up,
@@ -581,16 +572,14 @@ def _padded(
             noise=density,
             # the right singular vectors of a direction: itself, and two that span the plane across it
             basis=np.linalg.svd(across)[2][:, 1:, :],
-            mask=used,
+            mask=interval.any(axis=1),
         ),
         gravity=np.asarray(gravity),
     )
 
 
-def _with_noise(
-    observations: Observations, parts: Sequence[Segmentation], noise: NoiseModel, spans: FloatArray
-) -> Observations:
-    """Replace what the poses' scatter tells of the noise by what the model says; `spans` (turns, 2) start and stop."""
+def _with_noise(observations: Observations, parts: Sequence[Segmentation], noise: NoiseModel) -> Observations:
+    """Replace what the poses' scatter tells of the noise by what the model says."""
     poses, turns = observations.poses, observations.turns
     padded, count = len(poses.mask), int(np.sum(poses.mask))
     start, stop = poses.start[:count], poses.stop[:count]
@@ -611,7 +600,7 @@ def _with_noise(
         name: str, signal: Signal, start: FloatArray, stop: FloatArray, same: BoolArray
     ) -> tuple[FloatArray, FloatArray]:
         """White density and covariance over intervals of which the first are the poses, white noise in theirs."""
-        white, slow = noise_by_model(signal, require_model(signal, getattr(noise, name), name), start, stop, same)
+        white, slow = noise_by_model(signal, getattr(noise, name), name, start, stop, same)
         slow[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)[:count]
         return white, slow
 
@@ -628,7 +617,8 @@ def _with_noise(
         elapsed = np.cumsum(turns.interval, axis=1) - turns.interval / 2
         total = np.maximum(np.sum(turns.interval, axis=1, keepdims=True), 1e-9)
         part_of_turn = np.minimum(_PARTS - 1, (_PARTS * elapsed / total).astype(np.int64))
-        edges = spans[used, :1] + np.diff(spans[used]) * np.arange(_PARTS + 1) / _PARTS
+        begin = stop[used, None]
+        edges = begin + (start[used + 1, None] - begin) * np.arange(_PARTS + 1) / _PARTS
         first = np.concatenate([start, edges[:, :-1].ravel()])
         last = np.concatenate([stop, edges[:, 1:].ravel()])
         owner = np.concatenate([power_on, power_on[used].repeat(_PARTS)])
@@ -681,8 +671,9 @@ def _turns(gyroscope: Signal, intervals: FloatArray, shift: FloatArray) -> list[
     unsure = _across_gaps(gyroscope)
     durations, period = np.diff(gyroscope.edges), 1 / gyroscope.rate
     turns = []
-    for start, stop in zip(intervals[:-1, 1], intervals[1:, 0], strict=True):
-        used = _samples(gyroscope, start, stop)
+    between = intervals.ravel()[1:-1].reshape(-1, 2)
+    for (start, stop), edges in zip(between, gyroscope.time.searchsorted(between), strict=True):
+        used = slice(*edges)
         inside = durations[used]
         # differences of turns that the noise cannot hide
         gapless = len(inside) and inside.max() <= max(5 * period, 0.05) and unsure[used].max() <= _BRIDGED
