@@ -12,7 +12,7 @@ import re
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import islice, takewhile
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -284,9 +284,9 @@ class _Guess:
         free = self._free(triads)
         role = self.role or self.file
         if role == "gyro" and gyro is None and accel is None:
-            gyro = self._only(free)
+            gyro = self._only(free, role)
         elif role == "accel" and accel is None:
-            accel = self._only(free)
+            accel = self._only(free, role)
         if accel is None and role != "gyro":
             accel = self._by_gravity(free, gyro)
         if accel is not None and gyro is None:
@@ -325,11 +325,9 @@ class _Guess:
 
     def _carry_on(self) -> None:
         """Let the time go on where a counter starts again, whatever its end is."""
-        if self.time is not None and (values := self.numbers[self.time]) is not None:
-            steps = np.diff(values)
-            if (steps < 0).any():
-                steps = np.where(steps < 0, np.median(steps[steps > 0]), steps)
-                self.numbers[self.time] = values[0] + np.cumulative_sum(steps, include_initial=True)
+        if self.time is not None and ((steps := np.diff(self._clock)) < 0).any():
+            steps = np.where(steps < 0, np.median(steps[steps > 0]), steps)
+            self.numbers[self.time] = self._clock[0] + np.cumulative_sum(steps, include_initial=True)
 
     def _named_triads(self) -> list[_Triad]:
         """The triads that names show, of whatever sensor."""
@@ -415,10 +413,9 @@ class _Guess:
         for at, field, values in self._looked_at():
             if at in taken or values is None or field.sensor or field.why_not or set(field.stem) & _COUNTERS:
                 continue
-            finite = values[np.isfinite(values)]
-            steps = np.diff(finite)
+            steps = np.diff(values[np.isfinite(values)])
             counter = rises(values) and ((steps == 1.0).mean() > 0.9 or (steps > 0).mean() > 0.98)
-            if np.ptp(finite) > 0 and not counter:
+            if steps.any() and not counter:
                 free.append(at)
         for at in [*free]:
             four = range(at, at + 4)
@@ -440,11 +437,11 @@ class _Guess:
             unknown = [*unknown, *filter(None, three)]
         return unknown
 
-    def _only(self, free: list[_Triad]) -> _Triad | None:
+    def _only(self, free: list[_Triad], role: str) -> _Triad | None:
         if len(free) != 1:
             return None
         why = "the file is called after it" if self.role is None else "no other triad is there"
-        self.reasons.append(f"columns {free[0].label} are the {GROUPS[self.role or self.file or 'accel'].field}: {why}")
+        self.reasons.append(f"columns {free[0].label} are the {GROUPS[role].field}: {why}")
         return free[0]
 
     def _by_gravity(self, free: list[_Triad], gyro: _Triad | None) -> _Triad | None:
@@ -456,9 +453,8 @@ class _Guess:
             posed = [triad for triad in holding if triad.posed]
             physical = [triad for triad in holding if triad.gravity_unit == "m/s^2"]
             holding = posed if len(posed) == 1 else physical if len(physical) == 1 and not posed else holding
-        candidates = holding or [
-            triad for triad in free if triad.whole and ((triad.posed and triad.steady) or triad.round)
-        ]
+        round_ones = [triad for triad in free if triad.whole and ((triad.posed and triad.steady) or triad.round)]
+        candidates = holding or round_ones
         if len(candidates) == 1:
             one, unit = candidates[0], candidates[0].gravity_unit or ""
             several = len(free) > 1
@@ -508,9 +504,9 @@ class _Guess:
             for triad in free
             if not self.table.names or triad in self.unknown or all(_plain(self.fields[at]) for at in triad.places)
         ]
-        shown = " or ".join(triad.label for triad in unclear[:3])
         if unclear:
-            none = "" if len(unclear) == 1 else ", or none"
+            shown = " or ".join(triad.label for triad in unclear[:3])
+            none = ", or none" * (len(unclear) > 1)
             self._ask(f"Are columns {shown} the gyroscope{none}? Too little turns for physics to say.")
         return unclear[0] if len(unclear) == 1 else None
 
@@ -520,8 +516,13 @@ class _Guess:
         """Seconds of a triad's rows, as good as is known: by the time column in a plausible unit, or by 100 Hz."""
         if self.time is None:
             return triad.rows / (self.table.rate or ASSUMED_RATE)
-        values = np.asarray(self.numbers[self.time])[triad.rows]
+        values = self._clock[triad.rows]
         return (values - values[0]) * self._factor()
+
+    @property
+    def _clock(self) -> FloatArray:
+        """The numbers of the time column, where there is one."""
+        return np.asarray(self.numbers[self.time or 0])
 
     def _factor(self) -> float:
         """Seconds to one of the time column's unit, as good as is known."""
@@ -532,11 +533,6 @@ class _Guess:
 
     def _stated_time(self) -> Unit | None:
         return None if self.time is None or self.doubted else find_unit(self.fields[self.time].unit or "", "time")
-
-    def _stated_rate(self) -> float:
-        """Rows a second (Hz) by the stated unit of the stamps; NaN without one."""
-        stated = self._stated_time()
-        return 1.0 / max(self._step() * stated.factor, 1e-300) if stated else math.nan
 
     def _doubt_time(self) -> None:
         self.doubted = True
@@ -556,14 +552,13 @@ class _Guess:
 
     def _step(self) -> float:
         """How far the time column rises a row."""
-        values = np.asarray(self.numbers[self.time or 0])
-        steps = np.diff(values[np.isfinite(values)])
+        steps = np.diff(self._clock[np.isfinite(self._clock)])
         return steps.sum() / max(int((steps > 0).sum()), 1)
 
     def _time_units(self) -> list[tuple[str, float]]:
         """The units in which the stamps mean a plausible rate, or the stated one; by name and factor."""
         low, high = _PLAUSIBLE
-        first, step = np.nanmin(np.asarray(self.numbers[self.time or 0])), self._step()
+        first, step = np.nanmin(self._clock), self._step()
         rates = {unit: 1.0 / max(step * unit[1], 1e-300) for unit in _TIME_UNITS}
         stated = [unit for unit in rates if self.table.rate and abs(rates[unit] / self.table.rate - 1) < 0.1]
         if not stated and any(start < first < end for start, end in _DATES) and low <= 1 / (step * _DAY) <= high:
@@ -577,13 +572,13 @@ class _Guess:
     def _units(self, accel: _Triad | None, gyro: _Triad | None) -> None:
         if accel is not None:
             self._accel_unit(accel)
-        turned, best, rate = None, None, self._stated_rate()
+        turned, best, stated = None, None, self._stated_time()
+        rate = 1.0 / max(self._step() * stated.factor, 1e-300) if stated else math.nan
         if rate > FASTEST:
             self._doubt_time()
         if accel is not None and gyro is not None:
             unclear = self.time is not None and (rate < SLOWEST or self._stated_time() is None)
-            for factor in [factor for _, factor in self._time_units()] if unclear else [None]:
-                self.assumed = factor
+            for _, self.assumed in self._time_units() if unclear else [("", None)]:
                 fit = self._turning(accel, gyro)
                 if fit and (turned is None or abs(fit.correlation) > abs(turned.correlation)):
                     turned, best = fit, self.assumed
@@ -666,7 +661,7 @@ class _Guess:
             self.chosen[time] = Column(TIME, self.fields[time].unit)
             return slope
         label, options, step = self.table.label(time), self._time_units(), self._step()
-        if len(options) == 1 and (np.diff(np.asarray(self.numbers[time])) == 1.0).all() and not self.table.rate:
+        if len(options) == 1 and (np.diff(self._clock) == 1.0).all() and not self.table.rate:
             options = []  # rows counted from the first on
         if len(options) > 1 and slope is not None and gyro is not None:
             stated = find_unit(gyro.unit or "", "angular rate")
@@ -695,7 +690,8 @@ class _Guess:
         unit = self._kept(gyro, _fitting(gyro.unit, "gyro"), "angular rate", slope, _TURN)
         peak = np.abs(gyro.values).max()
         rest = np.abs(np.median(gyro.values, axis=0)).max()
-        resting = accel is not None and accel.still and not accel.posed and not gyro.turns
+        lying = accel is not None and accel.still and not accel.posed
+        resting = lying and not gyro.turns
         accel_unit = self._unit_of("accel_x")
         if unit is None and slope is not None:
             best, off = likeliest(slope, _ANGLES)
@@ -723,8 +719,8 @@ class _Guess:
             unit = "count"
         elif unit is None and accel_unit != "m/s" and slope is None:
             fits = _plausible(peak, rest, gyro.noise if resting else None)
-            if accel is not None and accel.still and not accel.posed and not resting:  # about the vertical
-                fits = [name for name in ("rad/s", "deg/s") if name in fits]
+            if lying and not resting:  # about the vertical
+                fits = [name for name in fits if name != "mdeg/s"]
             if len(fits) == 1:
                 unit = fits[0]
                 at_rest = f", and at rest {rest:.3g} with a scatter of {gyro.noise:.2g}" if resting else ""
@@ -886,26 +882,18 @@ class _Guess:
 
 def column_text(columns: Sequence[Column]) -> str:
     """The columns as `--columns` takes them, as short as can be."""
-    entries = []
-    names, at = [column.name for column in columns], 0
-    triads: dict[tuple, str] = {group.columns: key for key, group in GROUPS.items() if len(group.columns) == 3}
-    while at < len(columns):
-        triad = triads.get(tuple(names[at : at + 3]))
-        skipped = len(list(takewhile(lambda name: name is None, names[at:])))
-        if skipped:
-            entries += [f"_*{skipped}"] if skipped > 3 else ["_"] * skipped
-        else:
-            entries.append(column_title(triad or names[at] or "", columns[at].unit))
-        at += skipped or (3 if triad else 1)
-    return ",".join(entries)
+    text = ",".join(column_title(column.name or "_", column.unit) for column in columns)
+    for sensor in SENSORS:
+        text = re.sub(rf"{sensor}_x((?: \[[^\]]*\])?),{sensor}_y\1,{sensor}_z\1", rf"{sensor}\1", text)
+    return re.sub(r"(?<![^,])_(,_){3,}(?![^,])", lambda skipped: f"_*{skipped[0].count('_')}", text)
 
 
 def _plausible(peak: float, bias: float, noise: float | None) -> list[str]:
     """The units in which a sensor may read so much: 2300 °/s at most, and at rest 25 °/s of bias, 3 °/s of scatter."""
     units = []
-    for unit in ("rad/s", "deg/s", "mdeg/s"):
+    for unit, noisiest in (("rad/s", 3.0), ("deg/s", 1.0), ("mdeg/s", 3.0)):
         degree = math.degrees(_ANGLES[unit])
-        at_rest = noise is None or (bias * degree < 25 and 1e-4 < noise * degree < (1.0 if unit == "deg/s" else 3.0))
+        at_rest = noise is None or (bias * degree < 25 and 1e-4 < noise * degree < noisiest)
         if peak * degree < 2300 and at_rest and not (unit == "mdeg/s" and "deg/s" in units):
             units.append(unit)
     return units
@@ -944,8 +932,8 @@ def _alike(one: Field, other: Field) -> bool:
 
 def _lone_gyroscope(table: LogTable) -> str:
     path = Path(table.path)
-    others = sorted(path.parent.glob(f"*{path.suffix}")) if path.is_file() else []
-    names = [log.name for log in others if "acc" in log.name.lower() and "linear" not in log.name.lower()]
+    others = sorted(log.name for log in path.parent.glob(f"*{path.suffix}")) if path.is_file() else []
+    names = [name for name in others if "acc" in name.lower() and "linear" not in name.lower()]
     where = f"read both: {names[0]} --gyro-log {path.name}" if names else "give its file, and this one as --gyro-log"
     return (
         f"Where is the accelerometer? This file holds a gyroscope alone; {where}. Alone it can be calibrated on a "
