@@ -585,34 +585,29 @@ def _with_noise(observations: Observations, parts: Sequence[Segmentation], noise
     start, stop = poses.start[:count], poses.stop[:count]
     at_rest = np.arange(count)
     power_on = np.arange(len(parts)).repeat([len(part.intervals) for part in parts])
-    together = power_on[:, None] == power_on
-
-    def among(rows: IntArray, covariance: FloatArray, size: int) -> FloatArray:
-        """The covariance of these rows among so many, each of which has a variance of one else."""
-        whole = np.tile(np.eye(size), (3, 1, 1))
-        whole[:, rows[:, None], rows] = covariance
-        return whole
+    signals = parts[0].recording.signals
 
     def of_poses(covariance: FloatArray) -> FloatArray:
         return variances_of(covariance)[:, :padded].T[:, :, None] * np.eye(3)
 
     def by_model(
-        name: str, signal: Signal, start: FloatArray, stop: FloatArray, same: BoolArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """White density and covariance over intervals of which the first are the poses, white noise in theirs."""
-        white, slow = noise_by_model(signal, getattr(noise, name), name, start, stop, same)
-        slow[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)[:count]
-        return white, slow
+        name: str, start: FloatArray, stop: FloatArray, same: BoolArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """White density and covariance over intervals of which the first are the poses, white noise in theirs.
 
-    accelerometer, gyroscope = parts[0].recording.accelerometer, parts[0].recording.gyroscope
-    _, slow = by_model("accelerometer", accelerometer, start, stop, together)
-    slow[:, at_rest, at_rest] += np.concatenate([_rounding(part.recording.accelerometer, part) for part in parts], 1)
-    forces = among(at_rest, slow, padded)
+        And the variance (3, P) by which rounding shifts the means of the poses.
+        """
+        white, slow = noise_by_model(signals[name], getattr(noise, name), name, start, stop, same)
+        slow[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)[:count]
+        return white, slow, np.concatenate([_rounding(part.recording.signals[name], part) for part in parts], axis=1)
+
+    forces, rates = (np.tile(np.eye(size), (3, 1, 1)) for size in (padded, padded + _PARTS * len(turns.mask)))
+    _, slow, rounding = by_model("accelerometer", start, stop, power_on[:, None] == power_on)
+    slow[:, at_rest, at_rest] += rounding
+    forces[:, :count, :count] = slow
     poses = replace(poses, accelerometer_covariance=of_poses(forces))
-    intervals = padded + _PARTS * len(turns.mask)
-    rates = np.tile(np.eye(intervals), (3, 1, 1))
     part_of_turn = np.zeros(turns.interval.shape, np.int64)
-    if gyroscope is not None:
+    if "gyroscope" in signals:
         used = np.flatnonzero(turns.mask[: count - 1])
         elapsed = np.cumsum(turns.interval, axis=1) - turns.interval / 2
         total = np.maximum(np.sum(turns.interval, axis=1, keepdims=True), 1e-9)
@@ -623,14 +618,15 @@ def _with_noise(observations: Observations, parts: Sequence[Segmentation], noise
         last = np.concatenate([stop, edges[:, 1:].ravel()])
         owner = np.concatenate([power_on, power_on[used].repeat(_PARTS)])
         alike = owner[:, None] == owner
-        white, slow = by_model("gyroscope", gyroscope, first, last, alike)
+        white, slow, rounding = by_model("gyroscope", first, last, alike)
         # a later power-on has another bias: what its means at rest have in common tells nothing of the first one's
-        slow += (alike & (owner > 0)) * np.square(POWER_ON["gyroscope"] * gyroscope.nominal_scale)[:, None, None]
-        shift = np.sqrt(np.concatenate([_rounding(part.recording.gyroscope or gyroscope, part) for part in parts], 1))
+        free = np.square(POWER_ON["gyroscope"] * signals["gyroscope"].nominal_scale)
+        slow += (alike & (owner > 0)) * free[:, None, None]
+        shift = np.sqrt(rounding)
         # every pose of a recording reads the same rate, and rounds it the same way
-        slow[:, :count, :count] += shift[:, :, None] * shift[:, None, :] * together
+        slow[:, :count, :count] += shift[:, :, None] * shift[:, None, :] * alike[:count, :count]
         rows = np.concatenate([at_rest, (padded + _PARTS * used[:, None] + np.arange(_PARTS)).ravel()])
-        rates = among(rows, slow, intervals)
+        rates[:, rows[:, None], rows] = slow
         poses = replace(poses, gyroscope_covariance=of_poses(rates))
         turns = replace(turns, noise=white)
     return Observations(poses, turns, observations.gravity, SlowNoise(forces, rates, part_of_turn))

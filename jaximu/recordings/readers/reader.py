@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from importlib import import_module
 from pathlib import Path
@@ -544,7 +544,7 @@ class _FilePart:
     signals: dict[str, Signal]
     origin: Fraction | float
     notes: tuple[str, ...]
-    units: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str]
 
 
 def extract(
@@ -566,8 +566,11 @@ def extract(
     stamps, origin, notes = _stamps(table, used, options)
     notes = [*table.notes, *notes]
     signals: dict[str, Signal] = {}
-    for key in sorted(groups & {group_of[name] for name in used if name != TIME}, key=list(GROUPS).index):
-        places = [used[name] for name in GROUPS[key].columns]
+    units: dict[str, str] = {}
+    for key, group in GROUPS.items():
+        if group.columns[0] not in used:
+            continue
+        places = [used[name] for name in group.columns]
         values = [(table.numbers(at), at, _per_second(unit, key, stamps)) for at, unit in places]
         if key == "mag" and len(groups) > 1 and any(np.unique(axis[~np.isnan(axis)]).size == 1 for axis, *_ in values):
             notes.append("the magnetometer, or an axis of it, never changes: it is left out.")
@@ -579,15 +582,14 @@ def extract(
         if dropped == len(stamps):
             if key in ("accel", "gyro"):
                 raise table.refused(f"column {table.label(values[0][1])} is empty.")
-            notes.append(f"{GROUPS[key].field}: the columns are empty.")
+            notes.append(f"{group.field}: the columns are empty.")
             continue
         if dropped:
-            notes.append(f"{GROUPS[key].field}: {dropped} of {len(stamps)} rows hold no whole sample of it.")
-        signals[key] = signal
+            notes.append(f"{group.field}: {dropped} of {len(stamps)} rows hold no whole sample of it.")
+        signals[key], units[group.field] = signal, places[0][1].name
     unused = [table.label(index) for index, column in enumerate(columns) if column.name is None]
     if unused and table.names and options.columns is None and not table.messages:
         notes.append(f"columns not used: {', '.join(unused)}.")
-    units = {GROUPS[key].field: used[GROUPS[key].columns[0]][1].name for key in signals}
     return _FilePart(table.source, signals, origin, tuple(notes), units)
 
 
@@ -682,7 +684,7 @@ def _rising(table: LogTable, clock: int, unit: Unit) -> LogTable:
     steps = np.diff(stamps)
     if not (steps <= 0).any() or np.isnan(stamps).any():
         return table
-    back = np.flatnonzero(steps < 0) + 1
+    back, usual = np.flatnonzero(steps < 0) + 1, np.median(np.abs(steps[steps != 0])) if steps.any() else 0.0
     if len(back) and (even := _even_clock(stamps)) is not None:
         spread = np.std(stamps - even) * unit.factor
         text = (
@@ -703,7 +705,6 @@ def _rising(table: LogTable, clock: int, unit: Unit) -> LogTable:
             notes = []  # the rows that are kept are in order
         notes.append(Defect("data.duplicate", text))
     kept_steps = np.diff(stamps[kept])
-    usual = np.median(np.abs(steps[steps != 0])) if (steps != 0).any() else 0.0
     # of two runs that are sorted into each other every other step is at most half of the usual one
     close, before = (int(np.sum((gaps >= 0) & (gaps < _HALVED * usual))) for gaps in (kept_steps, steps))
     if len(back) and close > max(20, 0.02 * len(stamps)) + before:

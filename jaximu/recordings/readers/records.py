@@ -97,10 +97,10 @@ def _table(columns: Mapping[str, Any], source: Source) -> LogTable:
             whole = all(isinstance(value, int) or (isinstance(value, str) and value.isdigit()) for value in array)
             arrays[name] = array.astype(np.int64) if whole else numbers
         except (TypeError, ValueError, OverflowError):
-            if all(isinstance(value, str) for value in values):
-                if (stamps := seconds_of(np.array(values, dtype=object))) is not None:
-                    arrays[f"{name} [ns]"] = stamps
-            elif all(isinstance(value, list) for value in values) and len(set(map(np.shape, values))) == 1:
+            kinds = set(map(type, values))
+            if kinds == {str} and (stamps := seconds_of(np.array(values, dtype=object))) is not None:
+                arrays[f"{name} [ns]"] = stamps
+            elif kinds == {list} and len(set(map(np.shape, values))) == 1:
                 arrays[name] = np.array(values, dtype=float)
     return table_of(arrays, source)
 
@@ -120,11 +120,9 @@ def _by_sensor(records: list[Json], source: Source) -> Iterator[LogTable]:
         named = {}
         for name, values in columns.items():
             last = name.rpartition(".")[2].lower()
-            title = f"{sensor}_{last}" if last in ("x", "y", "z") else name
-            if android:
-                unit = "ns" if name == "timestamp" else _ANDROID[sensor] if last in ("x", "y", "z") else ""
-                title = column_title(title, unit)
-            named[title] = values
+            title, unit = (f"{sensor}_{last}", _ANDROID[sensor]) if last in ("x", "y", "z") else (name, "")
+            unit = "ns" if name == "timestamp" else unit
+            named[column_title(title, unit if android else "")] = values
         table = _table(named, source)
         yield table.noted('units are those of Android\'s sensors, by "type" in each line.') if android else table
 
@@ -277,12 +275,9 @@ def _differ_in_turn(values: np.ndarray, count: int) -> bool:
 
 def _alike(table: LogTable, groups: Sequence[np.ndarray]) -> bool:
     """Whether the same columns are filled in the rows of each group."""
-    for column in table.columns:
-        filled = ~np.isnan(column) if column.dtype.kind == "f" else np.ones(len(column), bool)
-        shares = [filled[group].mean() for group in groups]
-        if max(shares) > 2 * min(shares) + 0.1:
-            return False
-    return True
+    filled = [~np.isnan(column) for column in table.columns if column.dtype.kind == "f"]
+    shares = [[column[group].mean() for group in groups] for column in filled]
+    return all(max(share) <= 2 * min(share) + 0.1 for share in shares)
 
 
 def _sensor(tag: Any) -> str | None:
