@@ -90,7 +90,7 @@ def main() -> None:
     found = [segment(recording) for recording in recordings]
     observations = observe_alike(found)
     segmented = time.perf_counter()
-    exact = observe_alike([Segmentation(r, t.intervals, 0.0, (), ()) for r, t in zip(recordings, truths, strict=True)])
+    exact = observe_alike([Segmentation(r, t.intervals, 0.0, {}, ()) for r, t in zip(recordings, truths, strict=True)])
     truth = stack(imus)
     nominal = stack([Imu.nominal()] * units)
 

@@ -49,7 +49,7 @@ def white_poses(frequency=100.0, unit=1.0, scale=1.0):
             Signal(each.time, each.values * scale, "count", np.full(3, scale))
             for each in (made.accelerometer, made.gyroscope)
         ))  # fmt: skip
-    return Segmentation(made, rests, 1.0, (), ())
+    return Segmentation(made, rests, 1.0, {}, ())
 
 
 # --- the integral and the covariance of means ------------------------------------------------------------------------
@@ -464,7 +464,7 @@ def test_a_model_that_does_not_fit_the_recording_is_refused():
     # rounded to 1 mm/s² while the noise is said to be of nanometres: a noise in other units
     made = part.recording
     rounded = Signal(made.accelerometer.time, np.round(made.accelerometer.values, 3), "m/s^2")
-    coarse = Segmentation(Recording(rounded, made.gyroscope), part.intervals, 1.0, (), ())
+    coarse = Segmentation(Recording(rounded, made.gyroscope), part.intervals, 1.0, {}, ())
     observed_poses(coarse, G, noise=good)
     with pytest.raises(InputError, match="other units"):
         observed_poses(coarse, G, noise=NoiseModel(bank(0.0, 30.0, white=1e-18), good.gyroscope))
@@ -472,7 +472,7 @@ def test_a_model_that_does_not_fit_the_recording_is_refused():
 
 def test_without_a_gyroscope_poses_alone_are_tied():
     part = white_poses()
-    alone = Segmentation(Recording(part.recording.accelerometer), part.intervals, 1.0, (), ())
+    alone = Segmentation(Recording(part.recording.accelerometer), part.intervals, 1.0, {}, ())
     observations = observed_poses(alone, G, noise=NoiseModel(bank(0.02, 30.0, white=1e-6)))
     a, b = part.intervals.T
     np.testing.assert_allclose(

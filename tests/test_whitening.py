@@ -266,7 +266,7 @@ def tied():
     """A recording all but free of noise, its poses known, with the slow bias of `_MODEL` in its observations."""
     truth = unit(31)
     made, rests = recording(31, poses=8, rest=2.0, turn=1.2, rates=(_RATE, _RATE), density=(1e-16, 1e-20), imu=truth)
-    part = Segmentation(made, rests, 1.0, (), ())
+    part = Segmentation(made, rests, 1.0, {}, ())
     return truth, part, observed_poses(part, GRAVITY, bucket=(10, 64), noise=_MODEL)
 
 

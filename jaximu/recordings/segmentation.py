@@ -5,7 +5,7 @@ accelerometer and the gyroscope, with two additions. The noise floor is the reco
 slow, smooth rotation, whose variance is as low as at rest, is told by its mean rate and by the drift of gravity.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -58,19 +58,19 @@ class SegmentationOptions:
 class Segmentation(Comparable):
     """Poses found in one recording, and how.
 
-    intervals: (P, 2) start and stop (s, on the recording's clock). threshold: the factor used. tried: for each factor
-    the number of intervals, of distinct orientations, and seconds at rest. notes: sentences for the user.
+    intervals: (P, 2) start and stop (s, on the recording's clock). threshold: the factor used. tried: by factor the
+    number of intervals. notes: sentences for the user.
     """
 
     recording: Recording
     intervals: FloatArray
     threshold: float
-    tried: tuple[tuple[float, int, int, float], ...]
+    tried: Mapping[float, int]
     notes: tuple[str, ...]
 
     def table(self) -> str:
         """Say in one line how many intervals each threshold gave."""
-        return ", ".join(f"{count} at {factor:g}x" for factor, count, _, _ in self.tried)
+        return ", ".join(f"{count} at {factor:g}x" for factor, count in self.tried.items())
 
 
 class Moments:
@@ -191,20 +191,20 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
 
     factors = THRESHOLDS if options.threshold is None else (options.threshold,)
     results = [runs(factor) for factor in factors]
-    tried = tuple(
-        (float(factor), len(intervals), distinct, float(np.diff(intervals).sum()))
-        for factor, (intervals, distinct) in zip(factors, results, strict=True)
-    )
+    counts = [len(intervals) for intervals, _ in results]
     # The lowest threshold that finds about all orientations there are without breaking poses in two.
-    score = np.array([distinct - 0.5 * (count - distinct) for _, count, distinct, _ in tried])
+    score = np.array(
+        [distinct - 0.5 * (count - distinct) for count, (_, distinct) in zip(counts, results, strict=True)]
+    )
     best = score.max()  # negative where the same few orientations come back again and again
-    chosen = int(np.flatnonzero(score >= best - 0.05 * abs(best))[0])
+    chosen = int((score >= best - 0.05 * abs(best)).argmax())
     intervals, notes = _drop_rotating(scan.moments, results[chosen][0])
     if len(intervals) < options.fewest:
         raise NotPossibleError(
             f"{recording.name}: {_why_no_poses(results[chosen][0], centres[-1] - centres[0], means[0], notes)}"
         )
-    return Segmentation(recording, intervals, tried[chosen][0], tried, tuple(notes))
+    tried = dict(zip(factors, counts, strict=True))
+    return Segmentation(recording, intervals, float(factors[chosen]), tried, tuple(notes))
 
 
 def find_stops(recording: Recording) -> Segmentation | None:
@@ -236,8 +236,8 @@ def find_stops(recording: Recording) -> Segmentation | None:
             f"{recording.name}: no stop was found, at which a vehicle stands still for two seconds or more with less "
             "vibration than in motion. Record a drive with stops of ten seconds or more."
         )
-    tried = (float(np.exp(threshold)), len(intervals), 1, float(np.diff(intervals).sum()))
-    return Segmentation(recording, intervals, tried[0], (tried,), tuple(notes))
+    factor = float(np.exp(threshold))
+    return Segmentation(recording, intervals, factor, {factor: len(intervals)}, tuple(notes))
 
 
 def _parting(values: FloatArray) -> tuple[float, float]:

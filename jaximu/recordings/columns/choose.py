@@ -13,9 +13,7 @@ Used = dict[str, tuple[int, Unit]]
 """By canonical name, the columns that are used: their index and unit."""
 
 
-def column_units(
-    table: LogTable, columns: Sequence[Column], option: str = "--columns", sensor: str | None = None
-) -> Used:
+def column_units(table: LogTable, columns: Sequence[Column], option: str, sensor: str | None) -> Used:
     """The used columns of a table by canonical name: their index and unit.
 
     Raises InputError for a doubled name, a triad without one of its axes, a unit that is missing (with a line to
@@ -100,20 +98,15 @@ def choose_pair(
     `gyro_columns` names those of the second file alone. Columns not given are read from the headers.
     """
     named = parse_columns(columns) if columns is not None else ()
+    of_gyro = [column for column in named if _is(column, "gyro")]
     first = choose_columns(accel, None) if not named else _fit(accel, named, _without(named, "gyro"))
-    if gyro_columns is not None:
+    if gyro_columns is not None or not named or (not of_gyro and header_columns(gyro)):
         return first, choose_columns(gyro, gyro_columns, "gyro", "--gyro-columns")
-    if not named or (not any(_is(column, "gyro") for column in named) and header_columns(gyro)):
-        return first, choose_columns(gyro, None, "gyro", "--gyro-columns")
-    if any(_is(column, "gyro") for column in named):
-        only = tuple(column for column in named if column.name == TIME or _is(column, "gyro"))
+    if of_gyro:
+        only = tuple(column for column in named if column.name == TIME or column in of_gyro)
         return first, _fit(gyro, named, _without(named, "accel"), only)
     swapped = tuple(Column((column.name or "").replace("accel_", "gyro_") or None, column.unit) for column in named)
-    counts = all(
-        (stated := find_unit(column.unit or "")) and stated.quantity == "raw count"
-        for column in named
-        if _is(column, "accel")
-    )
+    counts = all(find_unit(column.unit or "", "raw count") for column in named if _is(column, "accel"))
     if not counts or len(swapped) != len(gyro.columns):
         raise _unnamed(gyro, "gyro", "--gyro-columns")
     return first, swapped
@@ -129,7 +122,6 @@ def _without(columns: Sequence[Column], group: str) -> tuple[Column, ...]:
 
 def _fit(table: LogTable, *choices: tuple[Column, ...]) -> tuple[Column, ...]:
     """The first choice that has as many columns as the table."""
-    for choice in choices:
-        if len(choice) == len(table.columns):
-            return choice
+    if fitting := [choice for choice in choices if len(choice) == len(table.columns)]:
+        return fitting[0]
     raise _wrong_count(table, len(choices[0]), "--columns")

@@ -578,7 +578,8 @@ class _Guess:
             self._doubt_time()
         if accel is not None and gyro is not None:
             unclear = self.time is not None and (rate < SLOWEST or self._stated_time() is None)
-            for _, self.assumed in self._time_units() if unclear else [("", None)]:
+            for factor in [factor for _, factor in self._time_units()] if unclear else [None]:
+                self.assumed = factor
                 fit = self._turning(accel, gyro)
                 if fit and (turned is None or abs(fit.correlation) > abs(turned.correlation)):
                     turned, best = fit, self.assumed

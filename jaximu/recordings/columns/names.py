@@ -101,17 +101,17 @@ def header_columns(table: LogTable) -> tuple[Column, ...] | None:
         for at, field in enumerate(fields)
         if field.axis and not (field.sensor or field.why_not) and measures(field.unit) == "gyro"
     }
-    names = sorted(column.name or "" for column in rates.values())
-    known = {column.name for column in columns}
-    if tuple(names) == GROUPS["gyro"].columns and "accel_x" in known and not known.intersection(names):
+    gyro, known = GROUPS["gyro"].columns, {column.name for column in columns}
+    if (
+        sorted(column.name or "" for column in rates.values()) == [*gyro]
+        and "accel_x" in known
+        and known.isdisjoint(gyro)
+    ):
         columns = [rates.get(at, column) for at, column in enumerate(columns)]
     times = [at for at, column in enumerate(columns) if column.name == TIME]
-    bare = [at for at in times if fields[at].bare_time]
-    if bare and len(times) > 1:  # parts of a time of day, most likely
-        columns = [Column(None) if at in bare else column for at, column in enumerate(columns)]
-        times = [at for at in times if at not in bare]
-    if len(times) > 1:
-        best = max(times, key=lambda at: (rises(table.columns[at]), columns[at].unit is not None, -at))
+    if len(times) > 1:  # a unit alone names a part of a time of day, most likely
+        whole = [at for at in times if not fields[at].bare_time]
+        best = max(whole, key=lambda at: (rises(table.columns[at]), columns[at].unit is not None, -at), default=None)
         columns = [Column(None) if at in times and at != best else column for at, column in enumerate(columns)]
     return tuple(columns) if any(column.name for column in columns) else None
 
@@ -120,7 +120,8 @@ def rises(values: np.ndarray) -> bool:
     """Whether a column's numbers rise, with repeats and a few steps back, such as a counter's at its end."""
     if values.dtype == object or len(values) < 3:
         return False
-    steps = np.diff(values[np.isfinite(values)])
-    back = (steps < 0).sum()
-    ended = steps.sum() > 0 or bool(back and steps[steps < 0].max() < -np.ptp(values[np.isfinite(values)]) / 2)
-    return bool(len(steps) > 0 and (steps > 0).mean() > 0.2 and back < 0.02 * len(steps) and ended)
+    finite = values[np.isfinite(values)]
+    steps = np.diff(finite)
+    back = steps[steps < 0]
+    ended = steps.sum() > 0 or (len(back) and back.max() < -np.ptp(finite) / 2)
+    return bool(len(steps) and (steps > 0).mean() > 0.2 and len(back) < 0.02 * len(steps) and ended)
