@@ -139,14 +139,14 @@ def _wanted(quantity: str | tuple[str, ...] | None) -> tuple[str, ...]:
     return (quantity,) if isinstance(quantity, str) else quantity or tuple(BASE_UNITS)
 
 
-def find_unit(text: str, quantity: str | tuple[str, ...] | None = None) -> Unit | None:
+def find_unit(text: str | None, quantity: str | tuple[str, ...] | None = None) -> Unit | None:
     """The unit called `text`, None if unknown or of another quantity. A number scales it: "0.061 mg", "100 us".
 
     Letter case counts only where it must (mg and mG, s and S differ), and not where the quantity decides: an
     acceleration in "G" is in g, a temperature in "°" is in degC, and may be a line through counts: "count/340+36.53".
     """
     wanted = _wanted(quantity)
-    text = text.strip().replace("º", "°")
+    text = (text or "").strip().replace("º", "°")
     if match := _SCALED.fullmatch(text):
         scaled = find_unit(match[2], quantity)
         return scaled and Unit(text, scaled.quantity, scaled.factor * float(match[1]), scaled.offset)

@@ -68,14 +68,11 @@ class Turning(NamedTuple):
 
 def signed_permutation(matrix: FloatArray) -> FloatArray:
     """Return the signed permutation (3, 3) that is nearest to a matrix whose columns may have any length."""
-    columns = _directions(matrix.T).T
-    best, nearest = -np.inf, np.eye(3)
-    for order in permutations(range(3)):
-        entries = columns[order, range(3)]
-        total = np.abs(entries).sum()
-        if total > best + 1e-12:
-            best, nearest = total, np.zeros((3, 3))
-            nearest[order, range(3)] = np.where(entries < 0, -1.0, 1.0)
+    orders = np.array([*permutations(range(3))])
+    entries = _directions(matrix.T).T[orders, range(3)]
+    total = np.abs(entries).sum(axis=1)
+    best, nearest = (total > total.max() - 1e-12).argmax(), np.zeros((3, 3))
+    nearest[orders[best], range(3)] = np.where(entries[best] < 0, -1.0, 1.0)
     return nearest
 
 

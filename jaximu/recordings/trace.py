@@ -39,10 +39,10 @@ from typing import Any
 from jaximu.ground.document import Json, file_digest, read_toml
 from jaximu.ground.errors import FilePath, InputError, only
 
-_REFERENCE = ("name", "certificate", "expires", "file", "value", "uncertainty")
-_CERTIFICATE = ("number", "laboratory", "address", "customer", "authorised_by")
+_REFERENCE = tuple("name certificate expires file value uncertainty".split())
+_CERTIFICATE = tuple("number laboratory address customer authorised_by".split())
 NEEDED = (
-    *("serial", "model", "operator", "date", "environment", "reference"),
+    *"serial model operator date environment reference".split(),
     *(f"certificate.{key}" for key in _CERTIFICATE),
 )
 """What ISO/IEC 17025, 7.8.2 and 7.8.4, asks of a certificate and the recording does not say."""
@@ -99,7 +99,7 @@ def _date(value: Any, where: str) -> str:
 
 
 _SAID: dict[str, Callable[[Any, str], str]] = {
-    **{key: _text for key in ("serial", "model", "lot", "operator", "station", "fixture")},
+    **{key: _text for key in "serial model lot operator station fixture".split()},
     **{"date": _date, "received": _date},
 }
 """What a file's first part and options say, and what makes it out."""

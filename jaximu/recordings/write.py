@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaximu.ground.array_types import FloatArray
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.errors import FilePath, InputError
 from jaximu.ground.units import column_title
@@ -84,18 +83,15 @@ def _blocks(recording: Recording) -> Blocks:
     stamps = next(iter(signals.values())).time
     if not all(np.array_equal(signal.time, stamps) for signal in signals.values()):
         stamps = np.unique(np.concatenate([signal.time for signal in signals.values()]))
-    blocks: Blocks = {"time": _stamps(stamps, recording.start)}
+    blocks: Blocks = {"time": ("s", (recording.start + stamps)[:, None])}
+    if abs(recording.start) >= _LONG_AGO:
+        since = (stamps * 1e9).round().astype(np.int64)
+        blocks["time"] = "ns", (round(Fraction(recording.start) * 10**9) + since)[:, None]
     for key, signal in signals.items():
         values = np.full((len(stamps), signal.values.shape[1]), np.nan)
         values[np.searchsorted(stamps, signal.time)] = signal.values
         blocks[key] = signal.unit, values
     return blocks
-
-
-def _stamps(time: FloatArray, start: float) -> tuple[str, np.ndarray]:
-    if abs(start) < _LONG_AGO:
-        return "s", (start + time)[:, None]
-    return "ns", (round(Fraction(start) * 10**9) + (time * 1e9).round().astype(np.int64))[:, None]
 
 
 def _columns(recording: Recording) -> dict[str, np.ndarray]:

@@ -106,7 +106,7 @@ def choose_pair(
         only = tuple(column for column in named if column.name == TIME or column in of_gyro)
         return first, _fit(gyro, named, _without(named, "accel"), only)
     swapped = tuple(Column((column.name or "").replace("accel_", "gyro_") or None, column.unit) for column in named)
-    counts = all(find_unit(column.unit or "", "raw count") for column in named if _is(column, "accel"))
+    counts = all(find_unit(column.unit, "raw count") for column in named if _is(column, "accel"))
     if not counts or len(swapped) != len(gyro.columns):
         raise _unnamed(gyro, "gyro", "--gyro-columns")
     return first, swapped

@@ -26,7 +26,7 @@ from jaximu.ground.vectors import column_lengths, lengths_of
 from jaximu.recordings.alignment import CORRELATED, Turning, turning
 from jaximu.recordings.columns.habits import Field, fields_of, last_of, measures, sensor_of, words_of
 from jaximu.recordings.columns.known import EPOCH
-from jaximu.recordings.columns.names import COUNTS_ADVICE, GROUPS, TIME, Column, header_columns, rises
+from jaximu.recordings.columns.names import COUNTS_ADVICE, GROUPS, SINGLE, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
 from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.recording import FASTEST, SLOWEST, Signal, likeliest
@@ -64,8 +64,6 @@ _ANOTHER = math.log(2.0)  # logarithm by which a level at rest must miss 1 g for
 _COPY = 0.99  # share of an accelerometer's variance that its own values in another unit explain
 _HOTTEST = 125.0  # °C that a sensor survives
 _TURN = "turn gravity as the accelerometer shows"
-_SINGLE = ("temperature", "ambient_temperature", "current", "table_angle", "table_rate")
-"""Columns that are no triad's."""
 
 
 @dataclass(frozen=True)
@@ -302,9 +300,9 @@ class _Guess:
             if field.sensor == TIME and values is not None and rises(self.table.columns[at])
         ]
         if named:
-            return min(named, key=lambda at: find_unit(self.fields[at].unit or "", "time") is None)
+            return min(named, key=lambda at: find_unit(self.fields[at].unit, "time") is None)
         for at, field, values in self._looked_at():
-            named = find_unit(field.unit or "", "time") or {"time", "date"} & set(field.stem) or _ends_in_time(field)
+            named = find_unit(field.unit, "time") or {"time", "date"} & set(field.stem) or _ends_in_time(field)
             # any other name says something else: a counter, a tick, an angle
             if values is not None and not field.sensor and (named or _plain(field)) and rises(values):
                 steps = np.diff(values)
@@ -532,7 +530,7 @@ class _Guess:
         return self.assumed
 
     def _stated_time(self) -> Unit | None:
-        return None if self.time is None or self.doubted else find_unit(self.fields[self.time].unit or "", "time")
+        return None if self.time is None or self.doubted else find_unit(self.fields[self.time].unit, "time")
 
     def _doubt_time(self) -> None:
         self.doubted = True
@@ -641,7 +639,7 @@ class _Guess:
 
     def _kept(self, triad: _Triad, unit: str | None, quantity: str, factor: float | None, does: str) -> str | None:
         """The unit that is stated, None where the values show another one, of which `factor` is about one in SI."""
-        stated = find_unit(unit or "", quantity)
+        stated = find_unit(unit, quantity)
         if stated and factor and abs(math.log(factor / stated.factor)) >= _ANOTHER:
             self.reasons.append(f"{triad.label!r} is in {unit} by its name, in which it does not {does}")
             return None
@@ -665,7 +663,7 @@ class _Guess:
         if len(options) == 1 and (np.diff(self._clock) == 1.0).all() and not self.table.rate:
             options = []  # rows counted from the first on
         if len(options) > 1 and slope is not None and gyro is not None:
-            stated = find_unit(gyro.unit or "", "angular rate")
+            stated = find_unit(gyro.unit, "angular rate")
             angles = [stated.factor] if stated else [_ANGLES["rad/s"], _ANGLES["deg/s"]]
             raw = slope * self._factor()
             fits = {option for option in options for angle in angles if abs(math.log(raw / option[1] / angle)) < 0.25}
@@ -738,7 +736,7 @@ class _Guess:
         self._take(gyro, "gyro", unit)
 
     def _angle_increment(self, slope: float) -> str | None:
-        unit = find_unit(self.chosen[self.time].unit or "") if self.time is not None else None
+        unit = find_unit(self.chosen[self.time].unit) if self.time is not None else None
         interval = self._step() * unit.factor if unit else 1.0 / (self.table.rate or 1.0)
         if abs(math.log(slope * interval)) < 0.25:
             self.reasons.append("the gyroscope's increments, summed in rad, turn gravity as the accelerometer shows")
@@ -780,7 +778,7 @@ class _Guess:
             name = field.sensor or ""
             if name.startswith("attitude_"):
                 self.chosen[at] = Column(name, field.unit)
-            if name not in _SINGLE or values is None or self._unit_of(name):
+            if name not in SINGLE or values is None or self._unit_of(name):
                 continue
             unit = _fitting(field.unit, name)
             if unit is None and "temperature" in name:
@@ -902,7 +900,7 @@ def _plausible(peak: float, bias: float, noise: float | None) -> list[str]:
 
 def _fitting(unit: str | None, group: str) -> str | None:
     """A stated unit, if it is one of what the group's columns measure; "count" by whatever name."""
-    stated = find_unit(unit or "", GROUPS[group].quantities)
+    stated = find_unit(unit, GROUPS[group].quantities)
     return stated and ("count" if stated.quantity == "raw count" else unit)
 
 

@@ -115,8 +115,8 @@ _OWN = re.compile(r"(ambient_temperature|current|table_angle|table_rate|attitude
 
 def measures(unit: str | None, level: float | None = None) -> str | None:
     """The sensor of a unit, None for none. G and mG may be gravity or gauss, as which values of a `level` can be."""
-    measured = find_unit(unit or "")
-    gravity = find_unit(unit or "", "acceleration")
+    measured = find_unit(unit)
+    gravity = find_unit(unit, "acceleration")
     if measured and gravity and measured.quantity == "magnetic field":
         if level is not None and abs(level * gravity.factor / STANDARD_GRAVITY - 1) < _ABOUT:
             return "accel"
@@ -188,11 +188,11 @@ class Field:
                 if named and (at or short_sensor == "temperature"):
                     return cls(short, at, short_sensor, unit or named)
         if axis is None and (_time(words, unit) or (len(words) == 1 and words[0] in _TIME_ALONE)):
-            if words == ["t"] and find_unit(unit or "", "temperature"):
+            if words == ["t"] and find_unit(unit, "temperature"):
                 return cls(("t",), None, "temperature", unit)  # T (°)
             tail = next((word for word in reversed(words) if word in times and len(word) > 1), "")
             return cls(tuple(words), None, "time", unit or times.get(tail))
-        measured = find_unit(unit or "") if axis else None
+        measured = find_unit(unit) if axis else None
         if not stem and measured and measured.quantity == "time":  # X [s], the abscissa
             return cls((), None, "time", unit)
         if not stem and axis in tuple("xyz"):  # X (m/s^2)
@@ -200,7 +200,7 @@ class Field:
         if axis and stem[:2] in _ESTIMATED:
             sensor, why_not = None, "an estimated bias"
         # LowG_X (g): the letter is the unit's
-        of_unit = sensor == "gyro" and "g" in stem and find_unit(unit or "", "acceleration")
+        of_unit = sensor == "gyro" and "g" in stem and find_unit(unit, "acceleration")
         if axis and (of_unit or "temperature" in (sensor or "")):
             sensor = None
         return cls(stem, axis, sensor, unit, why_not)
@@ -258,7 +258,7 @@ def _without_prefix(names: Sequence[str]) -> list[str]:
 
 def _time(words: list[str], unit: str | None = None) -> bool:
     """Whether words name a time: by one that says so, or by a unit of time beside others that would fit one."""
-    timed = find_unit(unit or "", "time") or (len(words) > 1 and any(word in _TIME_ALONE for word in words))
+    timed = find_unit(unit, "time") or (len(words) > 1 and any(word in _TIME_ALONE for word in words))
     return (any(word in _TIME for word in words) or bool(words and timed)) and all(
         word in _TIME or word in _TIME_BESIDE or word.isdigit() for word in words
     )
@@ -287,19 +287,15 @@ def _axis(words: list[str]) -> tuple[tuple[str, ...], str | None]:
     return tuple(words), None
 
 
-def _gravity_beside(stem: tuple[str, ...]) -> tuple[tuple[str, ...], bool]:
-    """The words without those that say that gravity is in, and whether others say that it is not."""
-    for at, word in enumerate(stem[:-1]):
-        if stem[at + 1] in ("gravity", "g") and word in _WITH | _WITHOUT:
-            return (*stem[:at], *stem[at + 2 :]), word in _WITHOUT
-    return stem, False
-
-
 def sensor_of(stem: tuple[str, ...]) -> tuple[str | None, str | None]:
     """The sensor that the words of a name mean, None for none or more than one, and why it is not its measurement."""
     sensors: set[str] = set()
-    stem, without = _gravity_beside(stem)
-    why_not = "gravity is taken out" if without else None
+    why_not = None
+    for at, word in enumerate(stem[:-1]):  # with gravity, without gravity
+        if stem[at + 1] in ("gravity", "g") and word in _WITH | _WITHOUT:
+            why_not = "gravity is taken out" if word in _WITHOUT else None
+            stem = (*stem[:at], *stem[at + 2 :])
+            break
     for at, word in enumerate(stem):
         if word == "g" and set(stem[at + 1 :]) & _ACCELERATIONS:
             continue  # G-Force

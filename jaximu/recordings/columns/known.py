@@ -187,8 +187,8 @@ _ECHOED = (
 def _titled(title: str, name: str) -> str:
     """A program's title for a column, in the unit that the column's own name states where that is one of its kind."""
     (plain, usual), (_, stated) = parse_column(title), parse_column(name)
-    unit = find_unit(usual or "")
-    return column_title(plain, stated) if unit and find_unit(stated or "", unit.quantity) else title
+    unit = find_unit(usual)
+    return column_title(plain, stated) if unit and find_unit(stated, unit.quantity) else title
 
 
 def whole_stamps(table: LogTable) -> LogTable:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.ground.units import parse_column
+from jaximu.ground.units import SENSORS, parse_column
 from jaximu.recordings.columns.habits import Field, fields_of, measures
 from jaximu.recordings.columns.table import LogTable
 
@@ -21,27 +21,24 @@ class Group:
     quantities: tuple[str, ...]
 
 
-def _axes(pattern: str, axes: str = "xyz") -> tuple[str, ...]:
-    return tuple(map(pattern.format, axes))
-
-
-_SINGLE = {
-    "temperature": "temperature",
-    "ambient_temperature": "temperature",
-    "current": "electric current",
-    "table_angle": "angle",
-    "table_rate": "angular rate",
+_TRIADS = {  # in counts, and in increments over each sampling interval, too
+    "accel": ("acceleration", "raw count", "velocity increment"),
+    "gyro": ("angular rate", "raw count", "angle"),
+    "mag": ("magnetic field", "raw count"),
 }
+SINGLE = {
+    "temperature": ("temperature", "raw count"),
+    "ambient_temperature": ("temperature", "raw count"),
+    "current": ("electric current",),
+    "table_angle": ("angle",),
+    "table_rate": ("angular rate",),
+}
+"""Columns that are no triad's, and what they measure."""
 TIME = "time"
-GROUPS = {  # a triad may be in counts, and in increments over each sampling interval
-    "accel": Group("accelerometer", _axes("accel_{}"), ("acceleration", "raw count", "velocity increment")),
-    "gyro": Group("gyroscope", _axes("gyro_{}"), ("angular rate", "raw count", "angle")),
-    "mag": Group("magnetometer", _axes("mag_{}"), ("magnetic field", "raw count")),
-    **{
-        name: Group(name, (name,), (quantity, "raw count") if quantity == "temperature" else (quantity,))
-        for name, quantity in _SINGLE.items()
-    },
-    "attitude": Group("attitude", _axes("attitude_{}", "wxyz"), ("ratio",)),
+GROUPS = {
+    **{key: Group(SENSORS[key], tuple(f"{key}_{axis}" for axis in "xyz"), what) for key, what in _TRIADS.items()},
+    **{name: Group(name, (name,), quantities) for name, quantities in SINGLE.items()},
+    "attitude": Group("attitude", tuple(f"attitude_{axis}" for axis in "wxyz"), ("ratio",)),
 }
 COUNTS_ADVICE = (
     "state the data sheet's formula as its unit, such as temperature [count/340+36.53] (MPU-6050) or "

@@ -22,7 +22,7 @@ AXES = b"jaximu.axes"
 """Key of Arrow's metadata: the map by which a writer has put a log in body axes."""
 FEW = 0.01
 """Share of the rows up to which one that holds no whole sample costs itself, and not the recording."""
-_MISSING = {"-", "--", "---", "*", "?", "none", "err", "error", "missing", "overflow", "ovf", "inv", "invalid"}
+_MISSING = set("- -- --- * ? none err error missing overflow ovf inv invalid".split())
 """Words that programs write for a reading that is not there, beside those that Arrow knows."""
 _LARGEST = 1e30  # beyond it no unit makes a reading, and squares overflow
 _NINES = re.compile(r"9[9.]{2,}")

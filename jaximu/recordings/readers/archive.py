@@ -31,24 +31,7 @@ _ABOUT = ("meta", "__macosx")
 """Folders of what is about a recording."""
 _NO_LOG = set(".json .jsonc .xml .plist .yaml .yml .toml .html .md .pdf .png .jpg .svg .py .ipynb".split())
 """Suffixes of files that are logs only where there is no other."""
-SUFFIXES = (
-    ".csv",
-    ".tsv",
-    ".txt",
-    ".dat",
-    ".log",
-    ".parquet",
-    ".npz",
-    ".mat",
-    ".h5",
-    ".hdf5",
-    ".bag",
-    ".mcap",
-    ".db3",
-    ".ulg",
-    ".bin",
-    ".gz",
-)
+SUFFIXES = tuple(".csv .tsv .txt .dat .log .parquet .npz .mat .h5 .hdf5 .bag .mcap .db3 .ulg .bin .gz".split())
 """What a folder is searched for; a file that is named on its own may have any."""
 _BESIDE = (".truth.json", ".schedule.csv")
 _DIGITS = re.compile(rb"\d+")

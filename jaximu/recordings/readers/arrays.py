@@ -14,7 +14,7 @@ from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.recording import Source
 
 _WIDEST = 16  # an array with more columns than this is no sensor
-_RATES = {"samplingrate", "samplerate", "rate", "fs", "frequency", "freq", "samplingfrequency", "odr"}
+_RATES = set("samplingrate samplerate rate fs frequency freq samplingfrequency odr".split())
 _INTERVALS = dict.fromkeys(("ts", "dt", "sampletime", "sampleinterval", "samplinginterval"), 1.0) | {"intervalms": 1e3}
 _AXES = {3: ("x", "y", "z"), 4: ("w", "x", "y", "z")}
 

@@ -33,8 +33,15 @@ _HABITS = {
 """Names of columns, lower case with anything else between as "_"; the group is the axis."""
 _TUM = ("time [s]", "tx [m]", "ty [m]", "tz [m]", "qx", "qy", "qz", "qw")
 _FACTORS = {
-    **{"m/s": 1.0, "km/h": 1 / 3.6, "cm/s": 1e-2, "mm/s": 1e-3},
-    **{"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "ft": 0.3048},
+    "m/s": 1.0,
+    "km/h": 1 / 3.6,
+    "cm/s": 1e-2,
+    "mm/s": 1e-3,
+    "m": 1.0,
+    "cm": 1e-2,
+    "mm": 1e-3,
+    "km": 1e3,
+    "ft": 0.3048,
 }
 """Units of velocity and position in SI."""
 _Places = dict[str, dict[str, int]]

@@ -436,14 +436,9 @@ def _tables_of(path: FilePath, options: ReadOptions) -> tuple[LogTable, ...]:
         archive = is_archive(file)
     if not archive:
         return _tables_of_file(file, name, options)
-    try:
-        with opened(file, name) as files:
-            parts = {sensor: _tables_of_file(inner, inside, options) for sensor, (inside, inner) in files.items()}
+    with _whole(name, "a ZIP archive"), opened(file, name) as files:
+        parts = {sensor: _tables_of_file(inner, inside, options) for sensor, (inside, inner) in files.items()}
         source = Source(name, _hash(file), 0)
-    except InputError:
-        raise
-    except Exception as error:  # the library behind raises nearly anything on damaged archives
-        raise _damaged(name, "a ZIP archive", error) from error
     tables = parts.get("") or _of_sensors({sensor: first for sensor, (first, *_) in parts.items()})
     if "" in parts and file.is_dir():  # of a folder with one log in it
         tables = [table.noted(f"read from {files[''][0]}.") for table in tables]
@@ -467,9 +462,22 @@ def _of_sensors(tables: Mapping[str, LogTable]) -> list[LogTable]:
     return [whole[0].noted(*notes), *whole[1:]]
 
 
-def _damaged(name: str, kind: str, error: Exception) -> InputError:
-    reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
-    return InputError(f"{name}: begins like {kind} but cannot be read; it is cut off or damaged ({reason}).")
+@contextmanager
+def _whole(name: str, kind: str, needs: str | None = None) -> Iterator[None]:
+    """Say of a file that it is damaged, or lacks the package that it `needs`, where reading it fails."""
+    try:
+        yield
+    except InputError:
+        raise
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"{name}: is a {kind}, which needs the package {needs}: install it with pip install 'jaximu[formats]'."
+        ) from error
+    except Exception as error:  # the libraries behind raise nearly anything on damaged files
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        raise InputError(
+            f"{name}: begins like {kind} but cannot be read; it is cut off or damaged ({reason})."
+        ) from error
 
 
 def _tables_of_file(file: Path, name: str, options: ReadOptions) -> tuple[LogTable, ...]:
@@ -478,25 +486,15 @@ def _tables_of_file(file: Path, name: str, options: ReadOptions) -> tuple[LogTab
         kind = _recognise(file, name)
         data = file if kind is _TEXT or kind.needs else file.read_bytes()
     more = (options,) if kind.needs or kind is _TAGGED else ()
-    try:
-        with ThreadPoolExecutor(1) as beside:
-            # a thread costs a small file more than it saves
-            if isinstance(data, bytes) and len(data) < _SMALL:
-                sha256 = hashlib.sha256(data).hexdigest
-            else:
-                sha256 = beside.submit(_hash, file).result
-            read = getattr(import_module(f"jaximu.recordings.readers.{kind.module}"), kind.function)
-            tables = read(data, Source(name, "", 0), *more)
-            source = Source(name, sha256(), 0)
-    except InputError:
-        raise
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"{name}: is a {kind.name}, which needs the package {kind.needs}: install it with "
-            "pip install 'jaximu[formats]'."
-        ) from error
-    except Exception as error:  # the libraries behind raise nearly anything on damaged files
-        raise _damaged(name, kind.name, error) from error
+    with _whole(name, kind.name, kind.needs), ThreadPoolExecutor(1) as beside:
+        # a thread costs a small file more than it saves
+        if isinstance(data, bytes) and len(data) < _SMALL:
+            sha256 = hashlib.sha256(data).hexdigest
+        else:
+            sha256 = beside.submit(_hash, file).result
+        read = getattr(import_module(f"jaximu.recordings.readers.{kind.module}"), kind.function)
+        tables = read(data, Source(name, "", 0), *more)
+        source = Source(name, sha256(), 0)
     if tables == ():
         raise InputError(f"{name}: holds no message of these sensors; it is cut off or damaged.")
     whole = tables if isinstance(tables, tuple) else (tables,)

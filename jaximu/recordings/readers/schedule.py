@@ -27,7 +27,7 @@ from jaximu.recordings.entry import ScheduleEntry
 from jaximu.recordings.readers.reader import extract, read_table
 from jaximu.recordings.recording import ReadOptions, Recording
 
-_FIELDS = ("start", "stop", "kind", "x", "y", "z", "angle", "heading")
+_FIELDS = "start stop kind x y z angle heading".split()
 _QUANTITIES = {"start": "time", "stop": "time", "angle": "angle", "heading": "angle"}
 _Columns = dict[str, tuple[int, float]]
 """The place of each column, and the factor that takes it to SI."""
