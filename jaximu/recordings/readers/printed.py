@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 
 import numpy as np
 
@@ -184,10 +185,8 @@ def _rows(lines: list[str], sample: tuple[str, ...]) -> Iterator[tuple[int, list
 
 def _numbers(texts: Sequence[str]) -> np.ndarray:
     if all(re.fullmatch(r"[+-]?\d{1,18}", text) for text in texts[:1000]):
-        try:
+        with suppress(ValueError, OverflowError):
             return np.array(texts, np.int64)
-        except (ValueError, OverflowError):
-            pass
     return np.array(texts, float)
 
 
@@ -201,8 +200,7 @@ def read(data: bytes, source: Source) -> LogTable:
     if sample is None or len(rows) < 2:
         raise source.refused("holds no whole samples of text with labels.")
     first, cells = zip(*rows, strict=True)
-    columns = []
-    names = _names(sample)
+    columns, names = [], _names(sample)
     if _PROTOCOL.fullmatch(sample[0]):
         names[-1], note = "time [ns]", "InfluxDB's line protocol: fields by name, the time in ns at the end."
     elif sentence := _SENTENCE.match(sample[0]):

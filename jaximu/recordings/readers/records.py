@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -244,14 +245,11 @@ def _units_in_turn(table: LogTable) -> int:
     """
     columns = []
     for at, field in enumerate(fields_of(table.header)):
-        if table.names and field.sensor not in SENSORS:
-            continue
-        try:
-            values = np.asarray(table.numbers(at)[:_ROWS], float)
-        except InputError:
-            continue
-        if np.isfinite(values).all() and not rises(values):
-            columns.append(values)
+        if not table.names or field.sensor in SENSORS:
+            with suppress(InputError):
+                values = np.asarray(table.numbers(at)[:_ROWS], float)
+                if np.isfinite(values).all() and not rises(values):
+                    columns.append(values)
     rows = min(map(len, columns), default=0)
     for count in range(2, min(_MOST_IN_TURN, rows // (_PARTS * _FEWEST_A_PART)) + 1):
         if sum(_differ_in_turn(values, count) for values in columns) >= _AGREE:

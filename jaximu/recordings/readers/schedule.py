@@ -10,7 +10,6 @@ import csv
 import json
 import math
 import os
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -215,11 +214,10 @@ def _sections(sections: _Sections, name: str, recording: Recording) -> tuple[Sch
     entries = []
     for section, (first, last, angle) in sections.items():
         where = f"{name}, section {section}"
-        match = re.fullmatch(r"([xyz])_(p|a|rot)", section)
-        if match is None:
+        if section not in wanted:
             raise InputError(f"{where}: is not known; Ferraris' procedure has {', '.join(wanted)}.")
-        axis = np.eye(3)["xyz".index(match[1])] * (-1 if match[2] == "a" else 1)
-        kind, turned = ("turn", math.nan if angle is None else angle) if match[2] == "rot" else ("pose", 0.0)
+        axis = np.eye(3)["xyz".index(section[0])] * (-1 if section.endswith("a") else 1)
+        kind, turned = ("turn", math.nan if angle is None else angle) if "rot" in section else ("pose", 0.0)
         span = float(time[first] - half), float(time[last - 1] + half)
         entries.append(ScheduleEntry(*span, kind, axis, turned, label=where))
     entries.sort(key=lambda entry: entry.start)
