@@ -281,8 +281,6 @@ def _drop_rotating(moments: Sequence[Moments], intervals: FloatArray) -> tuple[F
     A rate about the vertical leaves gravity where it is. One at more than 30° to it that did not move gravity is the
     gyroscope's own, a step of its bias: where most of those that are off are such, none is taken for a turn.
     """
-    if not len(intervals):
-        return intervals, []
     start, stop = intervals.T
     middle = (start + stop) / 2
     (before, *spread), (after, *later) = moments[0].between(start, middle), moments[0].between(middle, stop)
@@ -649,11 +647,10 @@ def _across_gaps(gyroscope: Signal) -> FloatArray:
     error = np.zeros(len(gyroscope))
     gaps = np.flatnonzero(interval > 2.5 / gyroscope.rate)
     gaps = gaps[(gaps >= 3) & (gaps < len(gyroscope) - 5)]
-    if not len(gaps):
-        return error
-    rate = gyroscope.si()
-    before = (rate[gaps] - rate[gaps - 3]) / (gyroscope.time[gaps] - gyroscope.time[gaps - 3])[:, None]
-    after = (rate[gaps + 4] - rate[gaps + 1]) / (gyroscope.time[gaps + 4] - gyroscope.time[gaps + 1])[:, None]
+    rate, time = gyroscope.si(), gyroscope.time
+    before, after = (
+        (rate[last] - rate[last - 3]) / (time[last] - time[last - 3])[:, None] for last in (gaps, gaps + 4)
+    )
     error[gaps + 1] = np.square(interval[gaps]) / 12 * lengths_of(after - before)
     return error
 

@@ -816,24 +816,17 @@ class _Guess:
 
     # --- the result
 
-    def _lone_magnetometer(self) -> Advice:
-        columns = [c if (c.name or "").startswith(("mag_", "time")) else Column(None) for c in self.columns]
-        known = any(column.name == "mag_x" and column.unit for column in header_columns(self.table) or ())
-        text = None if known else column_text(columns)
-        option = f" --columns '{text}'" if text else ""
-        return Advice(
-            reasons=tuple(self.reasons),
-            questions=(
-                OpenPoint(
-                    f"This file holds a magnetometer alone: jaximu magnetometer {self.table.path}{option} calibrates "
-                    "it."
-                ),
-            ),
-            magnetometer=text,
-        )
-
-    def _without_triad(self) -> str:
+    def _without_triad(self) -> Advice:
         """What a table without accelerometer and gyroscope is."""
+        if self._unit_of("mag_x"):
+            columns = [c if (c.name or "").startswith(("mag_", "time")) else Column(None) for c in self.columns]
+            known = any(column.name == "mag_x" and column.unit for column in header_columns(self.table) or ())
+            text = None if known else column_text(columns)
+            option = f" --columns '{text}'" if text else ""
+            alone = (
+                f"This file holds a magnetometer alone: jaximu magnetometer {self.table.path}{option} calibrates it."
+            )
+            return Advice(reasons=tuple(self.reasons), questions=(OpenPoint(alone),), magnetometer=text)
         text = self.questions[0].text
         if self.attitude or any(why == "an estimated bias" for _, why in self.refused):
             text = (
@@ -845,7 +838,7 @@ class _Guess:
                 f" If they are a magnetometer's, jaximu magnetometer {self.table.path} --columns calibrates it, "
                 "with its columns named (mag [uT], or mag [count])."
             )
-        return text
+        return Advice(reasons=tuple(self.reasons), questions=(OpenPoint(text),))
 
     def _result(self, accel: _Triad | None, gyro: _Triad | None) -> Advice:
         if accel is None and self.role != "gyro":
@@ -858,9 +851,7 @@ class _Guess:
         elif gyro is None and self.role == "gyro":
             self._ask("Which columns are the gyroscope?")
         if accel is None and gyro is None:
-            if self._unit_of("mag_x"):
-                return self._lone_magnetometer()
-            return Advice(reasons=tuple(self.reasons), questions=(OpenPoint(self._without_triad()),))
+            return self._without_triad()
         stated = [column if column.name else Column(None) for column in header_columns(self.table) or ()]
         same = self.columns == stated
         order = sorted(self.chosen)

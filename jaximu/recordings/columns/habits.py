@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from unicodedata import combining, normalize
 
 from jaximu.ground.units import SENSORS, STANDARD_GRAVITY, find_unit, parse_column
+from jaximu.ground.units import unit as unit_named
 
 _SENSORS = {
     "accel": "a ac acc acce accel accl accels accelero accelerometer accelerometers acceleration accelerations "
@@ -329,12 +330,10 @@ _INTERVAL = re.compile(
 
 def stated_rate(text: str) -> float | None:
     """The sample rate in Hz that a file's preamble states, None for none or for several that differ."""
-    rates = set()
-    for match in _RATE.finditer(text):
-        value = float((match[1] or match[3]).replace(",", "."))
-        rates.add(value * (1e3 if (match[2] or "").lower() == "khz" else 1.0))
-    for match in _INTERVAL.finditer(text):
-        unit = find_unit(match[2], "time")
-        if unit and float(match[1]) > 0:
-            rates.add(round(1.0 / (float(match[1]) * unit.factor), 6))
+    rates = {
+        float((match[1] or match[3]).replace(",", ".")) * (1e3 if (match[2] or "").lower() == "khz" else 1.0)
+        for match in _RATE.finditer(text)
+    }
+    intervals = [float(match[1]) * unit_named(match[2], "time").factor for match in _INTERVAL.finditer(text)]
+    rates |= {round(1.0 / interval, 6) for interval in intervals if interval > 0}
     return rates.pop() if len(rates) == 1 and 0 < min(rates) < 1e5 else None

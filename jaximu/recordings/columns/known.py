@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePath
 
@@ -81,7 +81,7 @@ _LAYOUTS = [
         ),
     )
 ]
-_Named = tuple[tuple[str, ...], str]
+_Named = tuple[Sequence[str], str]
 """Names in our words, and a note of whose they are."""
 JOINED = "whole time [ns]"
 """Name of a column of stamps that was joined from two."""
@@ -102,7 +102,7 @@ def known_names(table: LogTable) -> _Named | None:
     if len(prefixes) == 1:  # the structure that holds them all
         names = [name.removeprefix(*prefixes) for name in names]
     layouts = [layout for layout in _LAYOUTS if layout.needed <= set(names)]
-    if not layouts and (ours := _of_message(table, table.names)):
+    if not layouts and (ours := _of_message(table)):
         return ours
     file = PurePath(table.path).name.lower()
     if set(names) == {"time", "seconds_elapsed", "x", "y", "z"} and ("gyro" in file or "accel" in file):
@@ -117,10 +117,10 @@ def known_names(table: LogTable) -> _Named | None:
     if not layouts:
         return None
     titles = layouts[0].columns
-    ours = tuple(
+    ours = [
         _titled(titles[name], original) if name in titles else original
         for name, original in zip(names, table.names, strict=True)
-    )
+    ]
     return ours, f"columns and units as {layouts[0].program} has them."
 
 
@@ -136,9 +136,10 @@ _MESSAGE = re.compile(r"(?:.*[./_])?(angular_velocity|linear_acceleration)[./_](
 EPOCH = 1e9, 2.2e9  # s since 1970 that a log's stamps lie between
 
 
-def _of_message(table: LogTable, names: tuple[str, ...]) -> _Named | None:
+def _of_message(table: LogTable) -> _Named | None:
     """The names of a table of sensor_msgs/Imu, whatever stands before them: a topic, a message's name."""
     titles = {"angular_velocity": "gyro_{} [rad/s]", "linear_acceleration": "accel_{} [m/s^2]"}
+    names = table.header
     matches = [_MESSAGE.fullmatch(name.strip().lower()) for name in names]
     known = [titles[match[1]].format(match[2]) if match else name for match, name in zip(matches, names, strict=True)]
     if sum(match is not None for match in matches) != 6 or len(set(known)) < len(known):
@@ -153,7 +154,7 @@ def _of_message(table: LogTable, names: tuple[str, ...]) -> _Named | None:
             known[at] = "time [ns]"
         elif since and plain in ("time", "timestamp", "stamp"):
             known[at] = "time [s]"
-    return tuple(known), (
+    return known, (
         "columns and units as sensor_msgs/Imu has them (rad/s, m/s^2): its linear_acceleration holds gravity."
     )
 
@@ -214,7 +215,7 @@ def whole_stamps(table: LogTable) -> LogTable:
             names = [*table.header]
             names[at] = JOINED
             joined = table.with_column(at, written * 10**9 + table.columns[rest] * (10**9 // parts))
-            return replace(joined, names=tuple(names)).noted(f"time is {table.label(at)} and {table.label(rest)}.")
+            return replace(joined, names=names).noted(f"time is {table.label(at)} and {table.label(rest)}.")
     return table
 
 

@@ -46,8 +46,8 @@ class LogTable:
     """
 
     source: Source
-    names: tuple[str, ...] | None
-    columns: tuple[np.ndarray, ...]
+    names: Sequence[str] | None
+    columns: Sequence[np.ndarray]
     rows: np.ndarray | int = 1
     rate: float | None = None
     notes: tuple[str, ...] = ()
@@ -65,7 +65,7 @@ class LogTable:
     @property
     def header(self) -> tuple[str, ...]:
         """The names in the file, a text a column: empty ones where it has no header."""
-        return self.names or ("",) * len(self.columns)
+        return tuple(self.names or ("",) * len(self.columns))
 
     def row(self, index: int | np.integer) -> int:
         """The number in the file, 1-based, of the row at `index`."""
@@ -82,7 +82,7 @@ class LogTable:
     def take(self, kept: np.ndarray) -> "LogTable":
         """The rows of these indices."""
         rows = np.arange(self.source.rows) + self.rows if isinstance(self.rows, int) else self.rows
-        columns = tuple(column[kept] for column in self.columns)
+        columns = [column[kept] for column in self.columns]
         return replace(self, columns=columns, rows=rows[kept], source=replace(self.source, rows=len(kept)))
 
     def with_column(self, index: int, values: np.ndarray) -> "LogTable":

@@ -61,7 +61,7 @@ def table_of(variables: Mapping[str, Any], source: Source) -> LogTable:
         for axis, column in zip(axes, array.T, strict=True):
             names.append(column_title(base if count == 1 else f"{base}_{axis}", unit))
             columns.append(np.ascontiguousarray(column, np.float64 if column.dtype.kind == "f" else np.int64))
-    table = LogTable(source, tuple(names), tuple(columns), rate=rate)
+    table = LogTable(source, names, columns, rate=rate)
     advice = "A gyroscope with its own clock needs a separate file: --gyro-log."
     return table.noted(f"not used: {listed(unused)} rows where others have {rows}. {advice}") if unused else table
 

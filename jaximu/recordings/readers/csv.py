@@ -91,7 +91,7 @@ def read(path: Path, source: Source) -> LogTable:
             columns[at], unit = with_unit
         if unit:
             names[at] = f"{parse_column(names[at])[0]} [{unit}]"
-    table = LogTable(source, tuple(names) if layout.names else None, tuple(columns), rows, layout.rate, remarks)
+    table = LogTable(source, names if layout.names else None, columns, rows, layout.rate, remarks)
     if not (wide or whole is None):
         table = table.noted(_CUT_OFF)
     if midnight:

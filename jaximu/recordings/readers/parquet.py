@@ -47,4 +47,4 @@ def read(data: bytes, source: Source) -> LogTable:
     nested = [field.name for field in schema if pa.types.is_nested(field.type)]
     vectors = vectors_apart(file.read(nested)) if nested else pa.table({})
     columns += map(from_arrow, vectors.columns)
-    return LogTable(source, named_with_units([*flat, *vectors.schema]), tuple(columns), axes=mapped_axes(schema))
+    return LogTable(source, named_with_units([*flat, *vectors.schema]), columns, axes=mapped_axes(schema))

@@ -221,7 +221,7 @@ def read(data: bytes, source: Source) -> LogTable:
         stamps = seconds_of(np.array(texts, object)) if _CLOCK.fullmatch(texts[0]) else None
         columns.append(_numbers(texts) if stamps is None else stamps)
         names[at] = names[at] if stamps is None else "time of day [ns]"
-    return LogTable(source, tuple(names) if any(names) else None, tuple(columns), np.array(first), notes=(note,))
+    return LogTable(source, names if any(names) else None, columns, np.array(first), notes=(note,))
 
 
 def _declared(data: bytes, source: Source, declared: re.Match[bytes]) -> LogTable:
@@ -234,4 +234,4 @@ def _declared(data: bytes, source: Source, declared: re.Match[bytes]) -> LogTabl
     columns = [_numbers([cell.decode().strip() for cell in column]) for column in zip(*whole, strict=True)]
     titles = [f"{name} [{unit.replace('deg C', 'degC')}]" for name, unit in zip(names, units, strict=True)]
     note = "rows of several kinds, declared by $COL and $UNIT as FlySight writes them: those of $IMU are read."
-    return LogTable(source, tuple(titles), tuple(columns), notes=(note,))
+    return LogTable(source, titles, columns, notes=(note,))

@@ -143,7 +143,7 @@ def read_frame(frame: Any, options: ReadOptions | None = None) -> Recording:
             f"expected a data frame of pandas or polars, an Arrow table or a mapping of equally long columns, found a "
             f"value of type {type(frame).__name__} ({str(error).splitlines()[0][:200]})."
         ) from error
-    columns = tuple(from_arrow(column) for column in table.columns)
+    columns = [from_arrow(column) for column in table.columns]
     read = LogTable(
         Source("data frame", "", 0), named_with_units(table.schema), columns, axes=mapped_axes(table.schema)
     )

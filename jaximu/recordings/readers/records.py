@@ -141,8 +141,8 @@ def of_sensor(table: LogTable, sensor: str) -> LogTable:
         raise table.refused(f"columns {', '.join(sorted(missing))} are missing; it has {table.header}.")
     places = {column.name: at for at, column in enumerate(columns)}
     kept = {name: columns[places[name]].unit for name in wanted if name in places}
-    names = tuple(column_title(name, unit) for name, unit in kept.items())
-    return replace(table, names=names, columns=tuple(table.columns[places[name]] for name in kept))
+    names = [column_title(name, unit) for name, unit in kept.items()]
+    return replace(table, names=names, columns=[table.columns[places[name]] for name in kept])
 
 
 def apart(table: LogTable) -> LogTable:
@@ -160,8 +160,8 @@ def apart(table: LogTable) -> LogTable:
             for axis in "xyz":
                 names[axes[axis]] = column_title(f"{sensor}_{axis}", parse_column(names[axes[axis]])[1])
             kept = [index for index in range(len(names)) if index != at and part.columns[index].dtype != object]
-            columns = tuple(part.columns[index] for index in kept)
-            parts.append(replace(part, names=tuple(names[index] for index in kept), rows=1, columns=columns))
+            columns = [part.columns[index] for index in kept]
+            parts.append(replace(part, names=[names[index] for index in kept], rows=1, columns=columns))
         return _joined(parts).noted(f"each row is one sensor's, by {table.label(at)}.")
     return table
 
@@ -300,4 +300,4 @@ def _joined(tables: list[LogTable]) -> LogTable:
         for name, values in part.items():
             columns[name][places] = values
     columns[clock] = stamps
-    return LogTable(replace(first.source, rows=len(stamps)), tuple(names), tuple(columns.values()), notes=first.notes)
+    return LogTable(replace(first.source, rows=len(stamps)), names, [*columns.values()], notes=first.notes)

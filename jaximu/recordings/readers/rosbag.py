@@ -284,4 +284,4 @@ class _Columns:
             if absent is None or not (double[absent] == -1.0).all():
                 names.append(name)
                 columns.append(double[at])
-        return LogTable(source, tuple(names), tuple(columns), notes=(f"{note}{clock[stamp]}.",), messages=True)
+        return LogTable(source, names, columns, notes=(f"{note}{clock[stamp]}.",), messages=True)

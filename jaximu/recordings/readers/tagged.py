@@ -78,9 +78,9 @@ def read(data: bytes, source: Source, options: ReadOptions) -> tuple[LogTable, .
         except pa.ArrowInvalid as error:
             reason = str(error).splitlines()[0][:200]
             raise source.refused(f"rows of {tag} cannot be read as a table: {reason}") from None
-        columns = map(from_arrow, table.columns)
-        names = (f"time [{log.unit}]", *map(name.format, "xyz"))
-        tables.append(LogTable(source, names, tuple(columns), messages=True))
+        columns = [from_arrow(column) for column in table.columns]
+        names = [f"time [{log.unit}]", *map(name.format, "xyz")]
+        tables.append(LogTable(source, names, columns, messages=True))
     if not tables:
         raise source.refused(f"is a log of {log.program} without a row of accelerometer or gyroscope.")
     note = f"a log of {log.program} (m/s^2, rad/s): {log.notes[stamp]}; each sensor has its own time stamps."
