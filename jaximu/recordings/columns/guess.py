@@ -38,8 +38,7 @@ _PLAUSIBLE = 0.5, 8000.0
 _LIKELY = 5.0, 4000.0
 """Hz: sample rates that a log may have, stamps that mean another are in another unit; and that one with turns has."""
 _MIDDLE_RATE = 50.0  # Hz; of two rates that stamps may mean, the nearer one on a log scale is likelier
-_FIELD_IN = {"uT": 50.0, "G": 0.5, "mG": 500.0, "nT": 5e4, "T": 5e-5}  # of the Earth
-_TIME_UNITS = ("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("100 us", 1e-4)
+_TIME_UNITS = [(name, unit_named(name).factor) for name in ("s", "ms", "us", "ns", "100 us")]
 _DAY, _DATES = 86400.0, ((3e4, 8e4), (7.24e5, 7.74e5))
 """Seconds, and the days of the years 1982 to 2119 since 1900, as in spreadsheets, and since 0, as in MATLAB."""
 _STEADY = 0.12
@@ -769,10 +768,11 @@ class _Guess:
         """Magnetometer and temperature, where name and unit are clear; what is not clear is left out."""
         for triad in triads:
             if triad.sensor == "mag" and not self._unit_of("mag_x"):
-                fitting = [name for name, size in _FIELD_IN.items() if 0.5 < triad.level / size < 1.4]
+                units = ("uT", "G", "mG", "nT", "T")  # in which it may be the Earth's field
+                fitting = [name for name in units if 25 < triad.level * unit_named(name).factor < 70]
                 unit = "count" if triad.whole and not triad.unit else _fitting(triad.unit, "mag")
-                if units := [unit] if unit else fitting:
-                    self._take(triad, "mag", units[0])
+                if unit or fitting:
+                    self._take(triad, "mag", unit or fitting[0])
         self._quaternion()
         for at, field, values in self._looked_at():
             name = field.sensor or ""
