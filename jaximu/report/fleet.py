@@ -183,7 +183,7 @@ def difference_words(difference: Difference) -> str:
 
 
 def _sessions(fleet: Fleet, stated: str) -> Iterator[Part]:
-    units, sessions = (sorted({place[index] for place in fleet.places}) for index in (0, 1))
+    units, sessions = (sorted({pair[index] for pair in fleet.places}) for index in (0, 1))
     if len(units) < 2 or len(sessions) < 2:
         return
     from jaximu.report.attribution import common_drift, drift_words  # most pages do without a diagnosis
