@@ -375,7 +375,8 @@ def _common_drifts(places: Mapping[tuple[str, str], Json]) -> tuple[tuple[Common
                 unit,
                 session,
                 np.array(row["rest_time"]),
-                *(np.reshape(row[name], (-1, 3)) for name in ("rest_up", "rest_rate")),
+                np.reshape(row["rest_up"], (-1, 3)),
+                np.reshape(row["rest_rate"], (-1, 3)),
                 random,
             )
             for unit, row in rows[:: max(1, -(-len(rows) // _UNITS_COMPARED))]

@@ -303,11 +303,12 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> Js
 
 def _at_rest(poses: Poses, imu: Imu) -> Json:
     """Return what a table keeps of a session's recording: when it rested, how it lay, and its gyroscope's rates."""
+    real = np.asarray(poses.mask)
     force, rate = (
-        np.linalg.solve(triad.gain, (np.asarray(mean, float)[np.asarray(poses.mask)] - triad.bias).T).T
-        for triad, mean in ((imu.accelerometer, poses.accelerometer_mean), (imu.gyroscope, poses.gyroscope_mean))
+        imu.triad(name).recover_on_host(np.asarray(getattr(poses, f"{name}_mean"))[real])
+        for name in ("accelerometer", "gyroscope")
     )
-    times = ((np.asarray(poses.start) + np.asarray(poses.stop)) / 2)[np.asarray(poses.mask)]
+    times = ((np.asarray(poses.start) + np.asarray(poses.stop)) / 2)[real]
     return {"rest_time": times, "rest_up": (force / lengths_of(force)[:, None]).ravel(), "rest_rate": rate.ravel()}
 
 
