@@ -37,6 +37,7 @@ from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
 from jaximu.recordings.recording import Signal
 from jaximu.recordings.segmentation import observed_poses, segment
+from jaximu.report.attribution import common_drift
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld
 
@@ -325,6 +326,8 @@ def test_a_drift_that_units_of_a_session_share_is_on_the_fleets_page(tmp_path, c
     assert warm.p_value == pytest.approx(1 / 1001) and alone.p_value > 0.05
     assert np.corrcoef(warm.curve, np.exp(-warm.times / (0.3 * 68.5)))[0, 1] > 0.98
     assert "What the gyroscopes of a session have in common in time" in output.with_suffix(".html").read_text()
+    picture, *others = common_drift([replace(warm, session=str(number)) for number in range(10)], [])
+    assert "Of 10 sessions the 8" in picture.caption and len(picture.draw().axes) == 8 and not others
     written = json.loads(output.with_suffix(".json").read_text())["common_drift"]
     assert [drift["session"] for drift in written] == ["1", "2"]
 

@@ -36,7 +36,7 @@ from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.page import Result
-from jaximu.ground.quantities import counted, listed
+from jaximu.ground.quantities import counted, in_order, listed
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.ground.vectors import column_lengths, root_or_zero
 from jaximu.mistakes.titles import effect_title
@@ -350,12 +350,12 @@ class Attribution(Result, Document, page="attribution"):
     @property
     def units(self) -> list[str]:
         """The units, by name."""
-        return _in_order(part.unit for part in self.recordings)
+        return in_order(part.unit for part in self.recordings)
 
     @property
     def sessions(self) -> list[str]:
         """The sessions, by name."""
-        return _in_order(part.session for part in self.recordings)
+        return in_order(part.session for part in self.recordings)
 
     @property
     def verdict(self) -> str:
@@ -413,7 +413,7 @@ class Attribution(Result, Document, page="attribution"):
                 "follows one of them, it can be compensated. It is no part of any unit's calibration."
             )
         effects = (one for one in self.findings if one.belongs_to == "unit" and one.name in CATALOGUE)
-        units = _in_order(unit for finding in effects for unit in finding.units)
+        units = in_order(unit for finding in effects for unit in finding.units)
         if not units:
             return ""
         files = shlex.join(part.file for part in self.recordings if part.unit == units[0])
@@ -441,11 +441,6 @@ def _by_name(documents: Sequence[Json], key: str, rank: Callable[[Json], float])
     for entry in sorted((entry for document in documents for entry in document[key]), key=rank):
         entries.setdefault(entry["name"], entry)
     return list(entries.values())
-
-
-def _in_order(names: Iterable[str]) -> list[str]:
-    """Return names without repetition, numbers by size."""
-    return sorted(dict.fromkeys(names), key=lambda name: (not name.isdigit(), len(name) * name.isdigit(), name))
 
 
 def places_of(files: Sequence[str], pattern: str) -> list[tuple[str, str]]:
@@ -559,7 +554,7 @@ def attribute(
     first = {index: ask(index, recording, "") for index, recording in enumerate(recordings)}
     parts = {index: part for index, part in first.items() if part is not None}
     require_several([(part.unit, part.session) for part in parts.values()], next(iter(skipped.values()), ""))
-    members = [[p for p in parts.values() if p.session == s] for s in _in_order(p.session for p in parts.values())]
+    members = [[p for p in parts.values() if p.session == s] for s in in_order(p.session for p in parts.values())]
     drifts = [common_drift(of) for of in members if len(of) > 1]
     common = [drift for drift in drifts if drift.p_value * len(drifts) < level]
     steady = _without_common_drift(parts, recordings, common)
@@ -650,8 +645,8 @@ def attributed(
                 Attributed(
                     name,
                     share.belongs_to,
-                    tuple(_in_order(part.unit for part in mine)),
-                    tuple(_in_order(part.session for part in mine)),
+                    tuple(in_order(part.unit for part in mine)),
+                    tuple(in_order(part.session for part in mine)),
                     share.share,
                     share.p_value,
                     {label: (values * sizes).tolist() for label, values in share.values.items()},
@@ -694,7 +689,7 @@ def attributed_lines(parts: Sequence[BoardRecording], level: float) -> tuple[lis
             values: dict[str, list[float]] = {}
             for part, one in mine:
                 values.setdefault(getattr(part, kind), []).append(one.middle)
-            units, sessions = (_in_order(getattr(part, name) for part, _ in mine) for name in ("unit", "session"))
+            units, sessions = (in_order(getattr(part, name) for part, _ in mine) for name in ("unit", "session"))
             share, p_value = len(members) / len(lines), min(members.values())
             findings.append(Attributed(MOVING_LINE, kind, tuple(units), tuple(sessions), share, p_value, values, "Hz"))
     apart = [part.place for index, (part, _) in enumerate(lines) if index not in shared["unit"] | shared["session"]]

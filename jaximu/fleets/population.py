@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 import scipy
 
 from jaximu.diagnosis.common_drift import CommonDrift, RestingRates
+from jaximu.diagnosis.evidence import FAMILY_LEVEL
 from jaximu.estimation.problem import Name
 from jaximu.fleets.rows import COLUMN_PLACES, PARAMETERS, SCHEMA, covariances, free_places, require_table
 from jaximu.ground.array_types import FloatArray, IntArray
@@ -30,7 +31,7 @@ from jaximu.ground.distributions import robust_sigma
 from jaximu.ground.document import Document, Json, entries
 from jaximu.ground.errors import FilePath, NotPossibleError
 from jaximu.ground.page import Result
-from jaximu.ground.quantities import counted
+from jaximu.ground.quantities import counted, in_order
 from jaximu.ground.vectors import root_or_zero, sigmas_of, variances_of
 from jaximu.mistakes.titles import effect_title
 
@@ -42,8 +43,6 @@ _MOST = 10_000
 """Units that the population is estimated from, evenly taken from a larger fleet: what keeps the memory bounded."""
 _UNITS_COMPARED = 32
 """Units of a session that are asked for a drift in common, evenly taken: a time course needs no more."""
-COMMON_LEVEL = 0.05
-"""Probability that chance passes for a drift in common, over all sessions: what a diagnosis of them has."""
 LEVEL = 0.01
 """Probability of one false alarm in the whole fleet, for each kind of question."""
 _ROUNDS = 200
@@ -182,7 +181,7 @@ class Fleet(Result, Document, page="fleet"):
     @property
     def common(self) -> list[CommonDrift]:
         """The time courses that are more than chance."""
-        return [drift for drift in self.drifts if drift.p_value * len(self.drifts) < COMMON_LEVEL]
+        return [drift for drift in self.drifts if drift.p_value * len(self.drifts) < FAMILY_LEVEL]
 
     def document(self) -> Json:
         """Return the findings as a JSON document of schema `jaximu.fleet/1`."""
@@ -367,8 +366,8 @@ def read_fleet(table: FilePath) -> Fleet:
 
 def _common_drifts(places: Mapping[tuple[str, str], Json]) -> tuple[tuple[CommonDrift, ...], list[str]]:
     """Return what gyroscopes of each session's units have in common in time, and why some sessions cannot be asked."""
-    random, drifts, notes = np.random.default_rng(20260101), [], []
-    for session in sorted({session for _, session in places}):
+    random, drifts, reasons = np.random.default_rng(20260101), [], []
+    for session in in_order(session for _, session in places):
         rows = [(unit, row) for (unit, of), row in places.items() if of == session and row.get("rest_time")]
         units = [
             RestingRates.of_means(
@@ -384,8 +383,9 @@ def _common_drifts(places: Mapping[tuple[str, str], Json]) -> tuple[tuple[Common
         try:
             drifts += [CommonDrift.of(units, random)] if len(units) > 1 else []
         except NotPossibleError as error:
-            notes.append(str(error))
-    return tuple(drifts), notes
+            reasons.append(str(error))
+    sessions = counted(len(reasons), "session")
+    return tuple(drifts), [f"{sessions} cannot be asked for a drift in common: {reasons[0]}"] if reasons else []
 
 
 def _of_population(path: Path, units: _Units, gyroscope: bool, total: int) -> Json:

@@ -5,7 +5,7 @@ JSON documents are for programs and keep SI and plain unit names; everything els
 
 import math
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 Z95 = 1.96
 """Standard deviations on either side of the mean that hold 95 % of a normal distribution."""
@@ -129,6 +129,11 @@ def counted(count: int, noun: str) -> str:
 def sentence(text: str) -> str:
     """Return the text with a capital at its start, unless it starts with the name of a file or an identifier."""
     return text if re.match(r"\S*[._/\\]\w", text) else text[:1].upper() + text[1:]
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Return names without repetition, numbers by size."""
+    return sorted(dict.fromkeys(names), key=lambda name: (not name.isdigit(), len(name) * name.isdigit(), name))
 
 
 def listed(words: Sequence[str], last: str = "and") -> str:

@@ -14,6 +14,9 @@ from jaximu.model.effects import CATALOGUE
 from jaximu.report import figures
 from jaximu.report.canvas import Figure
 
+_DRAWN = 8
+"""Sessions whose common drift is drawn at most."""
+
 
 def page_of(attribution: Attribution) -> Page:
     """Return the verdict, what belongs to units, sessions and the board, each recording's verdict, and time courses."""
@@ -100,13 +103,16 @@ def _first(attribution: Attribution) -> Iterator[Part]:
 
 def common_drift(drifts: Sequence[CommonDrift], common: Sequence[CommonDrift]) -> Iterator[Part]:
     """Draw what units of each session have in common in time, and say what could be behind that which is no chance."""
+    clearest = sorted(drifts, key=lambda drift: drift.p_value)[:_DRAWN]
     if drifts:
         yield Picture(
             "attribution",
-            partial(_drift_figure, drifts, common),
+            partial(_drift_figure, [drift for drift in drifts if drift in clearest], common),
             "What the gyroscopes of a session have in common in time",
             "Coloured: the common time course of each session, in a usual axis. Grey: each axis that has a part in it, "
-            "less what follows orientation, divided by its part; where grey follows the line, the course is common.",
+            "less what follows orientation, divided by its part; where grey follows the line, the course is common."
+            + f" Of {len(drifts)} sessions the {_DRAWN} where it is clearest."
+            * (len(drifts) > _DRAWN),
         )
     if common:
         yield Statement(

@@ -192,8 +192,10 @@ def _sessions(fleet: Fleet, stated: str) -> Iterator[Part]:
     yield Section(
         "Units and sessions",
         [
-            f"{len(units)} units were recorded in {len(sessions)} sessions. {together} `jaximu diagnose "
-            f"{shlex.quote(fleet.table)}{stated} -o RESULTS` says what belongs to a unit, to a session or to all.",
+            f"{len(units)} units were recorded in {len(sessions)} sessions.",
+            together * bool(fleet.drifts),
+            f"`jaximu diagnose {shlex.quote(fleet.table)}{stated} -o RESULTS` says what belongs to a unit, to a "
+            "session or to all.",
             *common_drift(fleet.drifts, fleet.common),
         ],
     )
