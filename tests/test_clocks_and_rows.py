@@ -9,7 +9,7 @@ from jaximu.calibration import calibrate
 from jaximu.cli import main
 from jaximu.ground.errors import InputError
 from jaximu.mistakes import inspect
-from jaximu.recordings.readers import ReadOptions, read_recording
+from jaximu.recordings.readers import ReadOptions, advise_reading, read_recording
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld
 
@@ -64,6 +64,73 @@ def test_a_clock_that_was_set_back_does_not_go_on(recording, tmp_path):
     time[3000:] -= 31.4
     with pytest.raises(InputError, match="two recordings in one file"):
         read_recording(write(tmp_path / "log.csv", time, values_of(recording)))
+
+
+def own_clock(recording):
+    """The accelerometer's stamps and values at full rate, and the gyroscope's of every other sample, 3 ms later."""
+    accel, gyro = recording.accelerometer, recording.gyroscope
+    return accel.time, accel.values, gyro.time[::2] + 0.003, gyro.values[::2]
+
+
+def side_by_side(path, names, arrays):
+    """A table of arrays of different lengths, with empty cells where one has no more."""
+    columns = [column for array in arrays for column in np.atleast_2d(array.T)]
+    rows = max(map(len, columns))
+    cells = [[*map(str, column), *[""] * (rows - len(column))] for column in columns]
+    path.write_text("\n".join(",".join(row) for row in [names, *zip(*cells, strict=True)]) + "\n")
+    return path
+
+
+TWO_CLOCKS = {
+    "named after the sensors": ("accTimestamp [s]", "gyroTimestamp [s]", ""),
+    "before each sensor's columns": ("time [s]", "time [s]", ""),
+    "counted": ("t1", "t2", "time [s],accel [m/s^2],gyro_time [s],gyro [rad/s]"),
+}
+
+
+@pytest.mark.parametrize("kind", TWO_CLOCKS)
+def test_a_gyroscope_with_a_clock_of_its_own_in_one_table(recording, tmp_path, kind):
+    first, second, stated = TWO_CLOCKS[kind]
+    arrays = own_clock(recording)
+    names = [first, *NAMES[:3], second, *NAMES[3:]] if not stated else [first, *"abc", second, *"def"]
+    path = side_by_side(tmp_path / "log.csv", names, arrays)
+    found = read_recording(path, options=ReadOptions(columns=stated or None, check=False))
+    for signal, time, values in ((found.accelerometer, *arrays[:2]), (found.gyroscope, *arrays[2:])):
+        np.testing.assert_allclose(signal.time, time, atol=1e-9)
+        np.testing.assert_allclose(signal.values, values)
+    assert any("separate time stamps" in note for note in found.notes)
+
+
+def test_a_guess_names_the_clock_of_the_gyroscope(recording, tmp_path):
+    path = side_by_side(tmp_path / "log.csv", [*"t ax ay az gyr_t gx gy gz".split()], own_clock(recording))
+    advice = advise_reading(path)
+    assert advice.columns == "time [s],accel [m/s^2],gyro_time [s],gyro [rad/s]"
+
+
+@pytest.mark.parametrize("more", [1, 3])
+def test_arrays_of_sensors_with_clocks_of_their_own(recording, tmp_path, more):
+    """Of the sensor that has fewer samples, and of the one that has more; `more`: of the gyroscope's to each."""
+    time, force, late, rate = own_clock(recording)
+    late, rate = np.repeat(late, more) + 0.001 * np.tile(np.arange(more), len(late)), np.repeat(rate, more, axis=0)
+    arrays = {"t_acc [s]": time, "acc [m/s^2]": force, "t_gyro [s]": late, "gyro [rad/s]": rate}
+    np.savez(tmp_path / "log.npz", **arrays)
+    found = read_recording(tmp_path / "log.npz", options=AS_IS)
+    np.testing.assert_allclose(found.gyroscope.time, late)
+    np.testing.assert_allclose(found.gyroscope.values, rate)
+    np.testing.assert_allclose(found.accelerometer.time, time)
+    arrays["t_gyro [s]"] = late + 1e6  # of another clock
+    np.savez(tmp_path / "log.npz", **arrays)
+    found = read_recording(tmp_path / "log.npz", options=AS_IS)
+    assert found.gyroscope is None
+    assert any("not used: 'gyro' has" in note for note in found.notes)
+
+
+def test_stamps_of_another_clock_are_not_those_of_the_samples_beside_them(recording, tmp_path):
+    accel, gyro = recording.accelerometer, recording.gyroscope
+    names = ["time [s]", *NAMES[:3], "gyroTimestamp [s]", *NAMES[3:]]
+    arrays = [accel.time, accel.values, accel.time + 1e6, gyro.values]
+    found = read_recording(side_by_side(tmp_path / "log.csv", names, arrays), options=AS_IS)
+    np.testing.assert_allclose(found.gyroscope.time, accel.time, atol=1e-9)
 
 
 @pytest.mark.parametrize("ids", [("0", "1"), ("left", "right")])

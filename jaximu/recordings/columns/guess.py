@@ -26,7 +26,7 @@ from jaximu.ground.vectors import column_lengths, lengths_of
 from jaximu.recordings.alignment import CORRELATED, Turning, turning
 from jaximu.recordings.columns.habits import Field, fields_of, last_of, measures, sensor_of, words_of
 from jaximu.recordings.columns.known import EPOCH
-from jaximu.recordings.columns.names import COUNTS_ADVICE, GROUPS, SINGLE, TIME, Column, header_columns, rises
+from jaximu.recordings.columns.names import CLOCKS, COUNTS_ADVICE, GROUPS, SINGLE, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
 from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.recording import FASTEST, SLOWEST, Signal, likeliest
@@ -229,6 +229,8 @@ class _Guess:
         self.assumed: float | None = None
         self.doubted = False  # whether the stamps are not in the unit that they state
         self.rate = self.accel_scale = self.gyro_scale = None
+        self.stated = header_columns(table) or ()
+        self.clocks = {CLOCKS[column.name]: at for at, column in enumerate(self.stated) if column.name in CLOCKS}
         self.unknown: list[_Triad] = []
         self.refused: list[tuple[_Triad, str]] = []  # triads that are named, and why they are no measurement
         self.attitude = False  # whether a quaternion is there: a trajectory may be beside it
@@ -299,7 +301,8 @@ class _Guess:
             if field.sensor == TIME and values is not None and rises(self.table.columns[at])
         ]
         if named:
-            return min(named, key=lambda at: find_unit(self.fields[at].unit, "time") is None)
+            stated = [at for at in named if self.stated and self.stated[at].name == TIME]
+            return min(stated or named, key=lambda at: find_unit(self.fields[at].unit, "time") is None)
         for at, field, values in self._looked_at():
             named = find_unit(field.unit, "time") or {"time", "date"} & set(field.stem) or _ends_in_time(field)
             # any other name says something else: a counter, a tick, an angle
@@ -513,8 +516,8 @@ class _Guess:
         """Seconds of a triad's rows, as good as is known: by the time column in a plausible unit, or by 100 Hz."""
         if self.time is None:
             return triad.rows / (self.table.rate or ASSUMED_RATE)
-        values = self._clock[triad.rows]
-        return (values - values[0]) * self._factor()
+        values = np.asarray(self.numbers[self.clocks.get(triad.sensor or "", self.time)])[triad.rows]
+        return (values - np.nanmin(self._clock)) * self._factor()
 
     @property
     def _clock(self) -> FloatArray:
@@ -773,6 +776,9 @@ class _Guess:
                 unit = "count" if triad.whole and not triad.unit else _fitting(triad.unit, "mag")
                 if unit or fitting:
                     self._take(triad, "mag", unit or fitting[0])
+        for sensor, at in self.clocks.items():
+            if self.time is not None and self._unit_of(f"{sensor}_x"):
+                self.chosen[at] = Column(f"{sensor}_time", self.fields[at].unit or self.chosen[self.time].unit)
         self._quaternion()
         for at, field, values in self._looked_at():
             name = field.sensor or ""
@@ -820,7 +826,7 @@ class _Guess:
         """What a table without accelerometer and gyroscope is."""
         if self._unit_of("mag_x"):
             columns = [c if (c.name or "").startswith(("mag_", "time")) else Column(None) for c in self.columns]
-            known = any(column.name == "mag_x" and column.unit for column in header_columns(self.table) or ())
+            known = any(column.name == "mag_x" and column.unit for column in self.stated)
             text = None if known else column_text(columns)
             option = f" --columns '{text}'" if text else ""
             alone = (
@@ -852,7 +858,7 @@ class _Guess:
             self._ask("Which columns are the gyroscope?")
         if accel is None and gyro is None:
             return self._without_triad()
-        stated = [column if column.name else Column(None) for column in header_columns(self.table) or ()]
+        stated = [column if column.name else Column(None) for column in self.stated]
         same = self.columns == stated
         order = sorted(self.chosen)
         rows = [tuple(column_text([self.chosen[at]]) for at in order)]

@@ -70,8 +70,7 @@ _TIME_BESIDE = _NEUTRAL | set(
     "s since start reboot boot seconds second unix epoch utc system sys local host device sample fine elapsed offset "
     "recording phone node chip epoc "
     "startup us ms ns sec nanosec nanoseconds nanos micros microseconds millis milliseconds usec msec nsec "
-    "accelerometer "
-    "acc gyro gyroscope logging arrival creation gps week whole "
+    "logging arrival creation gps week whole "
     "absolute relative and date txt day midnight mcu cpu board timer runtime".split()
 )
 _UNIT_NAMES = {
@@ -165,6 +164,12 @@ class Field:
         """Whether the name is a unit of time and no more."""
         return self.sensor == "time" and len(self.stem) == 1 and self.stem[0] in _TIME_ALONE
 
+    @property
+    def clock_of(self) -> str | None:
+        """The sensor whose stamps a column of time holds by its name (gyroTimestamp), None for no one sensor's."""
+        sensors = {_WORDS.get(word) for word in self.stem if len(word) > 2} & SENSORS.keys()
+        return sensors.pop() if self.sensor == "time" and len(sensors) == 1 else None
+
     @classmethod
     def of(cls, name: str) -> Field:
         """Read a column's name."""
@@ -188,7 +193,7 @@ class Field:
                 named = _UNIT_WORDS.get(short_sensor or "", {}).get(tail)
                 if named and (at or short_sensor == "temperature"):
                     return cls(short, at, short_sensor, unit or named)
-        if axis is None and (_time(words, unit) or (len(words) == 1 and words[0] in _TIME_ALONE)):
+        if not (axis and axis in "xyz") and (_time(words, unit) or (len(words) == 1 and words[0] in _TIME_ALONE)):
             if words == ["t"] and find_unit(unit, "temperature"):
                 return cls(("t",), None, "temperature", unit)  # T (°)
             tail = next((word for word in reversed(words) if word in times and len(word) > 1), "")
@@ -261,7 +266,8 @@ def _time(words: list[str], unit: str | None = None) -> bool:
     """Whether words name a time: by one that says so, or by a unit of time beside others that would fit one."""
     timed = find_unit(unit, "time") or (len(words) > 1 and any(word in _TIME_ALONE for word in words))
     return (any(word in _TIME for word in words) or bool(words and timed)) and all(
-        word in _TIME or word in _TIME_BESIDE or word.isdigit() for word in words
+        word in _TIME or word in _TIME_BESIDE or word.isdigit() or (len(word) > 2 and _WORDS.get(word) in SENSORS)
+        for word in words
     )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.ground.units import SENSORS, parse_column
+from jaximu.ground.units import SENSORS, find_unit, parse_column
 from jaximu.recordings.columns.habits import Field, fields_of, measures
 from jaximu.recordings.columns.table import LogTable
 
@@ -44,7 +44,12 @@ COUNTS_ADVICE = (
     "state the data sheet's formula as its unit, such as temperature [count/340+36.53] (MPU-6050) or "
     "[count/333.87+21] (MPU-9250)"
 )
-QUANTITIES = {TIME: ("time",)} | {name: group.quantities for group in GROUPS.values() for name in group.columns}
+CLOCKS = {f"{sensor}_time": sensor for sensor in ("gyro", "mag")}
+"""Columns of stamps that one sensor has for its own, and that sensor; `TIME` is the accelerometer's beside them."""
+QUANTITIES = dict.fromkeys((TIME, *CLOCKS), ("time",)) | {
+    name: group.quantities for group in GROUPS.values() for name in group.columns
+}
+_SAME = 0.01  # of the step, that two clocks of the same samples may differ by
 _SKIPPED = re.compile(r"(?:_|-|skip|)(?:\*(\d{1,4}))?")
 
 
@@ -76,7 +81,7 @@ def parse_columns(text: str | Sequence[str]) -> tuple[Column, ...]:
             raise InputError(f"--columns: the unit of {name} is for you to fill in; write it in place of the ?.")
         elif name in GROUPS and len(GROUPS[name].columns) > 1:
             columns.extend(Column(title, stated) for title in GROUPS[name].columns)
-        elif title := canonical(name):
+        elif title := name if name in CLOCKS else canonical(name):
             columns.append(Column(title, stated))
         else:
             raise InputError(
@@ -109,8 +114,33 @@ def header_columns(table: LogTable) -> tuple[Column, ...] | None:
     if len(times) > 1:  # a unit alone names a part of a time of day, most likely
         whole = [at for at in times if not fields[at].bare_time]
         best = max(whole, key=lambda at: (rises(table.columns[at]), columns[at].unit is not None, -at), default=None)
-        columns = [Column(None) if at in times and at != best else column for at, column in enumerate(columns)]
+        owners = {_owner(fields, columns, at): at for at in reversed(whole) if rises(table.columns[at])}
+        if "accel" in owners and owners.keys() & CLOCKS.values():
+            best = owners["accel"]
+        titles = {owners[sensor]: title for title, sensor in CLOCKS.items() if sensor in owners}
+        for at in times:
+            if at != best:
+                apart = at in titles and best is not None and _of_one_clock(table, columns, best, at)
+                columns[at] = Column(titles[at], columns[at].unit) if apart else Column(None)
     return tuple(columns) if any(column.name for column in columns) else None
+
+
+def _owner(fields: Sequence[Field], columns: Sequence[Column], at: int) -> str | None:
+    """The sensor whose stamps a column of time holds, by its name or as it stands right before its x axis."""
+    follows = columns[at + 1].name or "" if at + 1 < len(columns) else ""
+    return fields[at].clock_of or (follows.removesuffix("_x") if follows.endswith("_x") else None)
+
+
+def _of_one_clock(table: LogTable, columns: Sequence[Column], first: int, second: int) -> bool:
+    """Whether two columns of stamps count one time, and are not those of the same samples."""
+    stamps = []
+    for at in (first, second):
+        unit = find_unit(columns[at].unit, "time")
+        stamps.append(np.asarray(table.numbers(at), float) * (unit.factor if unit else 1.0))
+    one, other = stamps
+    span = np.nanmax(one) - np.nanmin(one)
+    overlap = min(np.nanmax(one), np.nanmax(other)) - max(np.nanmin(one), np.nanmin(other))
+    return bool(overlap > span / 2 and np.nanmax(np.abs(one - other)) > _SAME * span / len(one))
 
 
 def rises(values: np.ndarray) -> bool:

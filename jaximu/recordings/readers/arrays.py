@@ -2,14 +2,15 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from jaximu.ground.quantities import listed
 from jaximu.ground.units import SENSORS, column_title, parse_column
-from jaximu.recordings.columns.habits import sensor_of, words_of
+from jaximu.recordings.columns.habits import Field, sensor_of, words_of
+from jaximu.recordings.columns.names import TIME
 from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.recording import Source
 
@@ -43,17 +44,26 @@ def table_of(variables: Mapping[str, Any], source: Source) -> LogTable:
     sizes: Counter[int] = Counter()
     for _, array in arrays:  # parameters are many and short, the samples are where the numbers are
         sizes[max(array.shape)] += array.size
-    rows = sizes.most_common(1)[0][0]
+    clocks = _own_clocks(arrays)
+    rows = clocks["accel"][1].size if clocks else sizes.most_common(1)[0][0]
     names = []
     columns = []
     unused = []
     for name, array in arrays:
         array = array.reshape(-1, 1) if array.ndim == 1 or 1 in array.shape else array
-        array = array.T if array.shape[0] != rows and array.shape[-1] == rows else array
         base, unit = parse_column(name)
-        if array.shape[0] != rows or array.shape[1] > _WIDEST:
-            if 3 in array.shape and sensor_of(tuple(words_of(base)))[0] in SENSORS:
+        sensor = _triad(name, array)
+        title, stamps = clocks.get(sensor or "", ("", None))
+        size = rows if stamps is None else stamps.size
+        array = array.T if array.shape[0] != size and array.shape[-1] == size else array
+        if array.shape[0] != size or array.shape[1] > _WIDEST:
+            if sensor:
                 unused.append(f"{base!r} has {max(array.shape)}")
+            continue
+        if stamps is not None:
+            names.append(column_title(f"{sensor}_time", parse_column(title)[1] or stated.get(title)))
+            columns.append(stamps)
+        elif clocks and Field.of(name).sensor == TIME:
             continue
         unit = unit or stated.get(base)
         count = array.shape[1]
@@ -61,9 +71,34 @@ def table_of(variables: Mapping[str, Any], source: Source) -> LogTable:
         for axis, column in zip(axes, array.T, strict=True):
             names.append(column_title(base if count == 1 else f"{base}_{axis}", unit))
             columns.append(np.ascontiguousarray(column, np.float64 if column.dtype.kind == "f" else np.int64))
+    longest = max(map(len, columns))
+    columns = [
+        column if len(column) == longest else np.concatenate([column, np.full(longest - len(column), np.nan)])
+        for column in columns
+    ]
     table = LogTable(source, names, columns, rate=rate)
-    advice = "A gyroscope with its own clock needs a separate file: --gyro-log."
+    advice = "A sensor with its own clock needs its stamps beside it, as many as its samples (gyro_time)."
     return table.noted(f"not used: {listed(unused)} rows where others have {rows}. {advice}") if unused else table
+
+
+def _triad(name: str, array: np.ndarray) -> str | None:
+    """The sensor whose three axes an array holds, by its name."""
+    sensor = sensor_of(tuple(words_of(parse_column(name)[0])))[0] if 3 in array.shape else None
+    return sensor if sensor in SENSORS else None
+
+
+def _own_clocks(arrays: Sequence[tuple[str, np.ndarray]]) -> dict[str, tuple[str, np.ndarray]]:
+    """By sensor, name and values of the stamps that are as many as its samples; none where all have equally many.
+
+    Of one clock with the accelerometer's: sensors whose stamps do not overlap with those are left out.
+    """
+    counts = {sensor: max(array.shape) for name, array in arrays if (sensor := _triad(name, array))}
+    times = {array.size: (name, array.ravel()) for name, array in arrays if Field.of(name).sensor == TIME}
+    clocks = {sensor: times[count] for sensor, count in counts.items() if count in times}
+    if "accel" not in clocks or len(set(counts.values())) == 1:
+        return {}
+    first, last = clocks["accel"][1][[0, -1]]
+    return {sensor: clock for sensor, clock in clocks.items() if clock[1][0] < last and clock[1][-1] > first}
 
 
 def _opened(variables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

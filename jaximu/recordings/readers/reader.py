@@ -27,6 +27,7 @@ from jaximu.recordings.columns.choose import Used, choose_columns, choose_pair, 
 from jaximu.recordings.columns.guess import Advice, advise, without_gravity
 from jaximu.recordings.columns.known import JOINED, known_names, whole_stamps
 from jaximu.recordings.columns.names import (
+    CLOCKS,
     COUNTS_ADVICE,
     GROUPS,
     TIME,
@@ -228,8 +229,25 @@ def _parts(tables: Sequence[LogTable], options: ReadOptions) -> "list[_FilePart]
     alone = options.alone and GROUPS["accel"].columns[0] not in named and GROUPS["gyro"].columns[0] in named
     # an accelerometer under a name that says too little is asked about, and not left out
     sensor = "gyro" if alone and (options.columns is not None or not advise(first).accelerometer) else "accel"
-    parts = [extract(first, choose_columns(first, options.columns, sensor), options, set(GROUPS))]
-    return parts + [extract(table, header_columns(table) or (), options, set(GROUPS)) for table in tables[1:]]
+    named = [(first, choose_columns(first, options.columns, sensor))]
+    named += [(table, header_columns(table) or ()) for table in tables[1:]]
+    return [extract(*part, options, set(GROUPS)) for pair in named for part in _by_clock(*pair)]
+
+
+def _by_clock(table: LogTable, columns: Sequence[Column]) -> Iterator[tuple[LogTable, Sequence[Column]]]:
+    """The columns of each clock: a sensor with stamps of its own comes after the rest, and each without empty rows."""
+    names = [column.name or "" for column in columns]
+    owned = {title: {title, *GROUPS[CLOCKS[title]].columns} for title in CLOCKS if title in names}
+    if not owned:
+        yield table, columns
+        return
+    for clock, members in ({TIME: set(names).difference(*owned.values())} | owned).items():
+        places = [at for at, name in enumerate(names) if name in members]
+        headings = [table.header[at] or str(at + 1) for at in places]
+        part = replace(table, names=headings, columns=[table.columns[at] for at in places])
+        titles = [replace(columns[at], name=TIME) if names[at] == clock else columns[at] for at in places]
+        stamps = [part.numbers(at) for at, column in enumerate(titles) if column.name == TIME]
+        yield part.take(np.flatnonzero(~np.isnan(stamps).any(axis=0))) if stamps else part, titles
 
 
 def _finished(parts: "Sequence[_FilePart]", table: LogTable, options: ReadOptions) -> Recording:
@@ -263,7 +281,7 @@ def read_magnetometer(path: FilePath, options: ReadOptions | None = None) -> tup
         columns = header_columns(table) or () if named else choose_columns(table, options.columns, "mag")
         if options.rate is None and table.rate is None and not any(column.name == TIME for column in columns):
             options = replace(options, rate=1.0)
-        parts.append(extract(table, columns, options, {"mag"}))
+        parts += [extract(*part, options, {"mag"}) for part in _by_clock(table, columns)]
     part = next((candidate for candidate in parts if "mag" in candidate.signals), None)
     if part is None:
         raise InputError(f"{os.fspath(path)}: columns mag_x, mag_y, mag_z are missing.")
