@@ -369,14 +369,7 @@ def _rows(
     by_number = push @ means.increments + slopes[:, 18:21] @ means.by_earth
     by_drift = jnp.tile(-push @ means.by_drift, (1, errors.variance.shape[0]))
     shown = sees_earth(errors) | bool(part.sightings)
-    known = jnp.array(_first_root(1.0)).at[2].set(1 / jnp.where(shown, _RESTARTED, _HEADING))
-
-    def restarted(change):
-        end = after.moved(change)
-        off = rotate(anchor, logarithm(multiply(conjugate(anchor), end.attitude)))  # in the level frame: heading is z
-        return known * jnp.concatenate([off, end.velocity])
-
-    miss, by_end = value_and_jacobian(restarted, jnp.zeros(6))
+    miss, by_end = _restarted(after, anchor, jnp.where(shown, _RESTARTED, _HEADING))
     beside = (0, 0), (0, drifts)
     carrying = WhiteRows(
         weights @ jnp.hstack([slopes[:, :6], by_drift]),
@@ -391,6 +384,21 @@ def _rows(
     rows = [process, wander, _measured(means, part, *about)]
     rows += [_sighted(means, part, sighting, *about) for sighting in part.sightings]
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), *rows)
+
+
+def _restarted(after: MotionPath, anchor: Array, heading: Array) -> tuple[Array, Array]:
+    """Return by how much the end of a path misses (6,) where it begins anew, weighted, and the slopes over its change.
+
+    It is level about the attitude `anchor` (4,) and rests; its heading is known to `heading`, rad.
+    """
+    known = jnp.array(_first_root(1.0)).at[2].set(1 / heading)
+
+    def missed(change):
+        end = after.moved(change)
+        off = rotate(anchor, logarithm(multiply(conjugate(anchor), end.attitude)))  # in the level frame: heading is z
+        return known * jnp.concatenate([off, end.velocity])
+
+    return value_and_jacobian(missed, jnp.zeros(6))
 
 
 def _wandering(duration: Array, errors: Disturbances, numbers: int) -> WhiteRows:
@@ -619,7 +627,7 @@ def cut(
     begin, end, rest, restart = map(np.array, zip(*pieces, strict=True))
     if (ahead := rests[0, 0] - time[0]) > 1.0:
         notes.append(f"{recording.name}: the first {ahead:.1f} s, before the first rest, were left out.")
-    samples, count = padded_size(int((end - begin).max()) + beyond), len(begin)
+    samples = padded_size(int((end - begin).max()) + beyond)
     inside = begin[:, None] + np.arange(samples) < end[:, None]
     around = begin[:, None] + np.arange(-beyond, samples)
     around = around.clip(0, np.minimum(end + beyond, len(time))[:, None] - 1)
@@ -627,10 +635,8 @@ def cut(
     arrival = ~rest & ~restart & rest_follows
     sightings, ends = [], _padded(edges[end])
     if field is not None:
-        final = rest & ~rest_follows  # intervals that end a rest, in the order of rests
-        value, known = np.zeros((count, 3)), np.zeros(count)
-        value[final], known[final] = _mean_field(field, time[resting[:, 0]], time[resting[:, 1] - 1])
-        sightings.append(FieldSeen(ends, ends, _padded(known), _padded(value)))
+        stretches = time[resting[:, 0]], time[resting[:, 1] - 1]
+        sightings.append(_field_in_rests(field, stretches, rest & ~rest_follows, ends))
     if attitude is not None:  # in a rest any stamp will do; in motion one in the last sample
         latest = marks.searchsorted(edges[end], side="right") - 1
         since = np.where(rest, edges[begin], edges[end - 1])
@@ -649,10 +655,19 @@ def cut(
         _padded(arrival),
         _padded(restart),
         _padded((lost[at_samples] * inside).sum(axis=1)),
-        _padded(np.ones(count)),
+        _padded(np.ones(len(begin))),
         tuple(sightings),
     )
     return intervals, notes
+
+
+def _field_in_rests(
+    field: Signal, stretches: tuple[FloatArray, FloatArray], final: BoolArray, ends: FloatArray
+) -> FieldSeen:
+    """Return the mean field of rests, by their stretches of time, in the intervals that end one, in the same order."""
+    value, known = np.zeros((len(final), 3)), np.zeros(len(final))
+    value[final], known[final] = _mean_field(field, *stretches)
+    return FieldSeen(ends, ends, _padded(known), _padded(value))
 
 
 def _padded(values, mode: Any = "constant") -> FloatArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import equinox as eqx
@@ -338,23 +339,25 @@ def _followed(
         data=provenance([recording]) | {"updates": updates},
         alone={cause.name: _alone(question, cause) for cause in causes if len(cause.parameters) == 1},
     )
-    notes = [
-        *recording.notes,
-        *noise.notes,
+    notes = recording.notes, noise.notes, _remarks(validity, updates, scatter, diverged, len(old.tested))
+    return replace(validity, notes=tuple(dict.fromkeys(chain.from_iterable(notes))))
+
+
+def _remarks(validity: Validity, updates: int, scatter: float, diverged: str | None, tested: int) -> Iterator[str]:
+    """What is to be said of an answer that a filter gave; `tested`: how many numbers of the calibration are."""
+    yield (
         "the recording has too few poses, so a filter followed the calibrated unit through it, which measures in rests "
-        f"and where motion ends: {updates} updates.",
-    ]
+        f"and where motion ends: {updates} updates."
+    )
     if unknown := [shift.words for shift in validity.shifts if not shift.comparable]:
-        notes.append(
-            f"not determined without poses, each by itself: {', '.join(unknown)}. Record twenty poses to compare them."
-        )
-    if diverged is not None and verdict != "valid":
-        notes.append(diverged)
-    if verdict == "shifted" and any(len(cause.parameters) == len(old.tested) for cause in causes):
-        notes.append("so much differs that the calibration may be another unit's.")
+        names = ", ".join(unknown)
+        yield f"not determined without poses, each by itself: {names}. Record twenty poses to compare them."
+    if diverged is not None and validity.verdict != "valid":
+        yield diverged
+    if validity.verdict == "shifted" and any(len(cause.parameters) == tested for cause in validity.causes):
+        yield "so much differs that the calibration may be another unit's."
     if scatter > 1:
-        notes.append(f"innovations scatter {scatter:.2g} times their noise: the noise was widened by it.")
-    return replace(validity, notes=tuple(dict.fromkeys(notes)))
+        yield f"innovations scatter {scatter:.2g} times their noise: the noise was widened by it."
 
 
 def _without_place(calibration: Calibration, old: Old) -> Calibration:

@@ -189,24 +189,11 @@ def slow_noise(
     makes the experiment anew with another noise. **Returns:** the finding or None, the noise model with it, and what
     is to be said where slow bias and effects explain the misfit about as well.
     """
-    alpha = level * _SHARE / _TESTS
-    tried = []
     nothing = None, noise, ""
-    known = noise.gyroscope
-    evidence = state.evidence
-    if known is None:
+    known, evidence = noise.gyroscope, state.evidence
+    tried = [] if known is None else _slow_processes(experiment, state, noise, remade, level * _SHARE / _TESTS)
+    if known is None or not tried:
         return nothing
-    for name, unit in _slow_units(known, experiment.extent().duration).items():
-        added = remade(replace(noise, gyroscope=_joined(known, unit))).linearise(state.imu).covariance
-        added = (added - state.linear.covariance)[np.ix_(experiment.used, experiment.used)]
-        parts = _parted(evidence, state.weights @ added @ state.weights.T)
-        p_value = quadratic_tail(float(np.sum(parts[0] * parts[1])), parts[0])
-        strength, spread, gained = _variance(*parts, evidence.freedom)
-        if p_value < alpha and strength > 0:
-            tried.append((gained, name, p_value, strength, spread, unit, added))
-    if not tried:
-        return nothing
-    tried.sort(key=lambda entry: -entry[0])
     gained, name, p_value, strength, spread, unit, added = tried[0]
     rival = _criterion(evidence, selection) if selection.complete else -np.inf
     if gained <= rival - _TIE or any(
@@ -237,8 +224,33 @@ def slow_noise(
         f"the bias at rest and over the turns drifts more than the recording at rest showed: log-likelihood "
         f"{(gained + np.log(evidence.freedom)) / 2:+.1f}, p {p_value:.2g}"
     )
-    finding = NoiseFinding(name, axes, factor, sigma, p_value, _weak(p_value, alpha), text, rivals)
+    finding = NoiseFinding(name, axes, factor, sigma, p_value, _weak(p_value, level * _SHARE / _TESTS), text, rivals)
     return finding, replace(noise, gyroscope=corrected), ""
+
+
+def _slow_processes(
+    experiment: Experiment,
+    state: State,
+    noise: NoiseModel,
+    remade: Callable[[NoiseModel], Experiment],
+    alpha: float,
+) -> list[tuple[float, str, float, float, float, AxisNoise, FloatArray]]:
+    """Return what the gyroscope's slow bias may be that the data ask for at a level `alpha`, likeliest first.
+
+    Of each: log-likelihood gained, name, p-value, variance in that of the process and its sigma, the process, and the
+    covariance (c, c) that it adds.
+    """
+    known, tried = noise.gyroscope, []
+    assert known is not None
+    for name, unit in _slow_units(known, experiment.extent().duration).items():
+        added = remade(replace(noise, gyroscope=_joined(known, unit))).linearise(state.imu).covariance
+        added = (added - state.linear.covariance)[np.ix_(experiment.used, experiment.used)]
+        parts = _parted(state.evidence, state.weights @ added @ state.weights.T)
+        p_value = quadratic_tail(float(np.sum(parts[0] * parts[1])), parts[0])
+        strength, spread, gained = _variance(*parts, state.evidence.freedom)
+        if p_value < alpha and strength > 0:
+            tried.append((gained, name, p_value, strength, spread, unit, added))
+    return sorted(tried, key=lambda entry: -entry[0])
 
 
 def _otherwise(experiment: Experiment, state: State) -> Iterator[FloatArray]:
