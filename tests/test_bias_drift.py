@@ -42,6 +42,19 @@ def by_hand():
     return simulate(Imu.nominal(), HandHeld(poses=14), QUIET, rate=50.0, seed=3)[0]
 
 
+@pytest.mark.parametrize(
+    ("name", "factor"), [("gyroscope", np.degrees(1.0)), ("accelerometer", 10.0), ("gyroscope", 1e-2)]
+)
+def test_noise_that_is_not_of_the_recordings_sensors_is_noticed(by_hand, name, factor):
+    """A wrong unit of one sensor, or a table that shook; and nothing is said of the right noise."""
+    known = noise(1e-3, 100.0)
+    wrong = replace(known, **{name: replace(getattr(known, name), white=getattr(known, name).white * factor**2)})
+    for stated, times in ((known, 0), (wrong, 1)):
+        notes = [note for note in calibrate(by_hand, EXACT, static=stated).notes if "rests of this log show" in note]
+        assert len(notes) == times
+        assert all(note.startswith(name) for note in notes)
+
+
 @pytest.fixture(scope="module")
 def on_table():
     protocol = Positions(6, duration=8.0)

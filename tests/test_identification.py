@@ -50,7 +50,7 @@ def test_terms_come_back_with_intervals_that_cover(name):
     misfit = np.mean([each.misfit[0] / each.misfit[1] for each in found])
     assert 0.7 < misfit < 1.3
     # nor is anything else seen in it: no walk is taken for a warm-up, no chance peak for a line
-    assert not any(each.lines or each.warm_up or each.outliers for each in found)
+    assert not any(each.lines or each.warm_up or each.outliers or each.steps for each in found)
 
 
 def covariance_of(process: str, count: int, rate: float):
@@ -237,6 +237,37 @@ def test_a_warm_up_is_taken_out_and_a_walk_is_not():
     assert covers(found, "NK") >= binom.ppf(1e-4, 2 * count, 0.93)
     walks = np.cumsum(np.random.default_rng(5).standard_normal((60, 4096)), axis=1)  # nothing but walks
     assert not any(each.warm_up for each in identify(walks, RATE))
+
+
+@pytest.mark.parametrize("name", ["N", "NB", "NK"])
+@pytest.mark.parametrize("heights", [(1.0,), (-1.5, 1.0, 2.0)])
+def test_steps_of_the_level_are_taken_out_and_no_walk(name, heights):
+    """Steps far above what a walk does within the means around them; the terms are those without them."""
+    clean = axes_of(SCENES[name], 3, seed=5)
+    scale = 40 * np.std(np.diff(clean.reshape(3, 256, -1).mean(axis=2), axis=1))
+    places = [(2 * at + 1) * SAMPLES // (2 * len(heights)) + 37 for at in range(len(heights))]
+    stepped = clean + sum(
+        scale * height * (np.arange(SAMPLES) >= at) for height, at in zip(heights, places, strict=True)
+    )
+    for before, after in zip(identify(clean, RATE), identify(stepped, RATE), strict=True):
+        assert [step.time for step in after.steps] == pytest.approx([at / RATE for at in places], abs=0.5)
+        assert [step.size for step in after.steps] == pytest.approx([scale * height for height in heights], rel=0.1)
+        for term, value in before.terms.items():
+            there = after.terms[term]
+            assert value is None or value.low < there.value < value.high
+            assert value is not None or there is None or there.low < before.limits[term]
+
+
+def test_a_pause_longer_than_what_lies_before_is_not_filled():
+    """Its samples mirrored again and again would be a comb of lines."""
+    values = axes_of(SCENES["N"], 1)[0]
+    paused = np.concatenate(
+        [values[:6000], np.full(60_000, np.nan), values[6000:14_000], np.full(2000, np.nan), values[:9]]
+    )
+    one = identify(paused, RATE)
+    assert not one.lines
+    assert one.terms["N"].low < 0.01 < one.terms["N"].high
+    assert one.deviation.tau[-1] < 8000 / RATE
 
 
 def test_gauss_markov_processes_on_request():

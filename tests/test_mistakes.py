@@ -289,6 +289,19 @@ def test_stamps_of_a_logger_that_polls_are_evened_out(rate):
         assert np.ptp(late) < 0.05 / rate and 0 < late.mean() < 1 / rate
 
 
+@pytest.mark.parametrize("every", [2, 5])
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_rate_that_changes_is_no_jitter(every, order):
+    """From a third of the log on, or up to it, every second or fifth sample alone is there."""
+    log = generator.Log.of(unit(3)[0])
+    count, third = len(log.time), len(log.time) // 3
+    kept = np.concatenate([np.arange(third), np.arange(third, count, every)])
+    kept = kept if order == 1 else count - 1 - kept[::-1]
+    (finding, *others) = inspect(log.rows(kept).to_recording())
+    assert finding.name == "data.rate_change" and not finding.spoils
+    assert names(others) <= {"data.rate_change", "data.spikes"}
+
+
 def test_a_single_late_stamp_is_no_gap():
     log = generator.Log.of(unit(3)[0])
     time = log.time.copy()

@@ -40,7 +40,7 @@ from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.noise.at_rest import noise_of
+from jaximu.noise.at_rest import noise_of, unlike_rests
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording, same_outputs
@@ -326,7 +326,8 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
         fitted = fit(start, measurement, prior=prior, loss=loss, excess=fitted.excess)
         require_determined(fitted, where, prior=prior)
         observations = measurement.along(fitted.imu, tuple(fitted.imu.all_effects().values())).observations
-    notes = *notes_of(*recordings), *mixed, *notes_of(noise, *segmentations)
+    unlike = () if noise is None else unlike_rests(noise, segmentations)
+    notes = *unlike, *notes_of(*recordings), *mixed, *notes_of(noise, *segmentations)
     if held is not None:
         notes += (MISALIGNMENTS_HELD.format(poses),)
     if keep_gyroscope and not turns:

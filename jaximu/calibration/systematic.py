@@ -47,11 +47,11 @@ from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.effects.magnetic_field import SetupMagneticField
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.noise.at_rest import noise_of
+from jaximu.noise.at_rest import noise_of, white_in_rests
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, find_stops, rest_statistics
+from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, find_stops
 
 DRIFTS = 2
 """Gauss–Markov processes an axis that stand for all of a noise model's."""
@@ -74,13 +74,12 @@ NEIGHBOURS = 3
 
 def noise_at_rest(segmentation: Segmentation) -> NoiseModel:
     """Return white noise as a recording's rests show it, and the drift that is usual of such sensors."""
-    signals, rests = segmentation.recording.signals, segmentation.intervals
-    white = [
-        AxisNoise.of_white(np.diagonal(rest_statistics(signals[name], rests)[0]) / signals[name].nominal_scale ** 2)
-        for name in ("accelerometer", "gyroscope")
-    ]
+    rests = segmentation.intervals
+    white = {name: AxisNoise.of_white(density) for name, density in white_in_rests(segmentation).items()}
     duration = float(rests[-1, 1] - rests[0, 0])
-    return with_usual_drift(NoiseModel(white[0], white[1]), float(np.median(np.diff(rests, axis=1))), duration)
+    return with_usual_drift(
+        NoiseModel(white["accelerometer"], white["gyroscope"]), float(np.median(np.diff(rests, axis=1))), duration
+    )
 
 
 def known_scale(calibration: Calibration) -> Mapping[str, float]:

@@ -1,4 +1,4 @@
-"""`data.gap`, `data.jitter`, `data.bursts` and `data.time_scale`: what the stamps say."""
+"""`data.gap`, `data.jitter`, `data.bursts`, `data.rate_change` and `data.time_scale`: what the stamps say."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from jaximu.ground.quantities import counted
 from jaximu.mistakes.base import Samples, Sensor, off_cubic
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import FASTEST, Recording
-from jaximu.recordings.stamps import UNEVEN, missing_samples
+from jaximu.recordings.stamps import UNEVEN, missing_samples, stretches_of_one_rate
 
 TITLES = {
     "data.bursts": "stamps in bursts",
     "data.time_scale": "time scale",
+    "data.rate_change": "rate that changes",
     "data.gap": "gaps",
     "data.jitter": "jittering stamps",
 }
@@ -68,6 +69,16 @@ def _timing(name: str, sensor: Sensor, alike: Sequence[Sensor]) -> Iterator[Find
             "second: the unit of the time column is wrong. Change it in the header or with --columns.",
             spoils=True,
         )
+    if len(stretches := stretches_of_one_rate(sensor.time)) > 1:
+        rates = [1 / np.median(interval[part.start : part.stop - 1]) for part in stretches]
+        until = [f"{rate:.5g} Hz up to {sensor.time[part.stop]:.6g} s" for rate, part in zip(rates, stretches[:-1])]  # noqa: B905
+        yield Finding(
+            "data.rate_change",
+            sensor.rows(np.array([part.start for part in stretches[1:]])),
+            f"{name}: the rate changes: {', '.join(until)}, and {rates[-1]:.5g} Hz from there. Cut the log there, and "
+            "keep the logger at one rate.",
+        )
+        return
     missing = missing_samples(sensor.time)
     gaps = np.flatnonzero(missing)
     if len(gaps):

@@ -13,14 +13,15 @@ from jaximu.ground.document import SOFTWARE, Json, entries, read_document
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import FilePath, InputError, NotPossibleError
 from jaximu.ground.page import Result
-from jaximu.ground.quantities import size
+from jaximu.ground.quantities import listed, size
 from jaximu.ground.units import SENSOR_QUANTITIES
 from jaximu.ground.vectors import column_lengths
 from jaximu.mistakes import Prepared, prepared
 from jaximu.model.data_sheet import SI_UNITS
-from jaximu.noise.cleaning import PeriodicLine, without_outliers
+from jaximu.noise.cleaning import PeriodicLine, fillable, without_outliers
 from jaximu.noise.identification import Identified, identify
 from jaximu.recordings.recording import Recording, Signal, recordings_of
+from jaximu.recordings.stamps import stretches_of_one_rate
 
 SCHEMA = "jaximu.allan/1"
 _UNEVEN = 0.25
@@ -192,14 +193,20 @@ def _analysed(
     for recording in recordings:
         if getattr(recording, name) is not None:
             at_rest(recording, name)
-    lost = np.isnan(values[0])
+    part = fillable(values[0])
+    size, lost = part.stop - part.start, np.isnan(values[0, part])
+    if size < values.shape[1]:
+        notes.append(
+            f"{what} has pauses longer than what lies before them: its noise is that of the longest part between them, "
+            f"{size / rate:.0f} of {values.shape[1] / rate:.0f} s."
+        )
     if lost.any():
         notes.append(
             f"{longest.name}: {lost.sum()} samples of the {name} are missing; they are filled in by what lies "
             "before them, mirrored, and no difference of the deviation reaches over more than five in a row."
         )
     try:
-        axes = identify(values, rate, highest=highest)
+        axes = identify(values[:, part], rate, highest=highest)
     except NotPossibleError as error:
         raise NotPossibleError(f"{what}: {error}") from error
     assert isinstance(axes, list)
@@ -213,15 +220,18 @@ def _analysed(
 def evenly_sampled(signal: Signal, what: str = "the signal") -> tuple[FloatArray, float]:
     """Return (3, n) values in SI on an even grid, NaN where a sample is missing, and the rate (Hz).
 
-    Raises `InputError` where the stamps do not lie near a grid.
+    Of a signal whose rate changes, they are those of the longest stretch of one rate. Raises `InputError` where the
+    stamps do not lie near a grid.
     """
     if len(signal) < 3:
         raise NotPossibleError(f"{what} has only {len(signal)} samples.")
-    interval = np.diff(signal.time)
+    part = max(stretches_of_one_rate(signal.time), key=lambda part: part.stop - part.start)
+    time = signal.time[part]
+    interval = np.diff(time)
     steps = np.maximum(1, (interval / np.median(interval)).round()).astype(np.int64)
     index = np.cumulative_sum(steps, include_initial=True)
-    slope, start = np.polyfit(index, signal.time, 1)
-    off = abs(signal.time - start - slope * index) / slope
+    slope, start = np.polyfit(index, time, 1)
+    off = abs(time - start - slope * index) / slope
     if (off > _UNEVEN).mean() > 0.01:
         raise InputError(
             f"{what} is sampled unevenly: {100 * (off > _UNEVEN).mean():.0f} % of its stamps are more than a quarter "
@@ -229,7 +239,7 @@ def evenly_sampled(signal: Signal, what: str = "the signal") -> tuple[FloatArray
             "(_ in --columns) and give --rate."
         )
     values = np.full((signal.values.shape[1], index[-1] + 1), np.nan)
-    values[:, index] = signal.si().T
+    values[:, index] = signal.si()[part].T
     return values, float(1 / slope)
 
 
@@ -245,6 +255,12 @@ def _taken_out(name: str, axes: Sequence[Identified]) -> list[str]:
             notes.append(
                 f"{name} {axis}: periodic at {lines}, frequency after aliasing and amplitude; taken out. It is "
                 "vibration, the mains or a clock, and no noise of the sensor."
+            )
+        if it.steps:
+            steps = listed([f"{size(step.size, unit, 2)} after {step.time:.4g} s" for step in it.steps])
+            notes.append(
+                f"{name} {axis}: its level steps by {steps}, and stays there: taken out, for a step is no random walk. "
+                "A knock, a switch of supply or range, or the unit that settles may be behind it."
             )
         if it.high_pass is not None:
             time = it.high_pass

@@ -1,16 +1,23 @@
 """The noise of a recording at rest as a `NoiseModel`: what is missing, periodic or still is left out or refused."""
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 
+from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.quantities import listed
 from jaximu.mistakes import Prepared, prepared
 from jaximu.model.noise_model import AxisNoise, NoiseModel, fit_bank
 from jaximu.noise.analysis import at_rest
-from jaximu.noise.cleaning import BRIDGED, filled, periodic_lines
+from jaximu.noise.cleaning import BRIDGED, filled, periodic_lines, without_steps
 from jaximu.recordings.recording import Recording, recordings_of, runs_of
+from jaximu.recordings.segmentation import Segmentation, rest_statistics
 
 _OF_ITS_OWN = {"data.periodic", "data.gap"}
 """Findings that the fit makes itself, with numbers."""
+_NOISIER, _HAND = 3.0, 30.0
+"""Times the noise in the rests of a log that no recording at rest has, and times a hand at most adds to it."""
 _FEWEST = 1000
 """Samples below which a spectrum cannot tell white noise from slow bias."""
 
@@ -30,6 +37,33 @@ def fit_noise(recording: Recording) -> NoiseModel:
     """
     with prepared([recording], gravity=False) as (ready,):
         return _of_ready(ready)
+
+
+def white_in_rests(segmentation: Segmentation) -> dict[str, FloatArray]:
+    """Return the white noise in the rests of a recording, by triad a density N² (3,), SI² · s."""
+    signals = {name: segmentation.recording.signals.get(name) for name in ("accelerometer", "gyroscope")}
+    return {
+        name: np.diagonal(rest_statistics(signal, segmentation.intervals)[0]) / signal.nominal_scale**2
+        for name, signal in signals.items()
+        if signal is not None
+    }
+
+
+def unlike_rests(noise: NoiseModel, segmentations: Sequence[Segmentation]) -> Iterator[str]:
+    """Say of a noise model that it is not of the sensors whose rests are shown: far noisier, or far too quiet."""
+    seen = [white_in_rests(part) for part in segmentations]
+    for name in seen[0]:
+        signals = [part.recording.signals[name] for part in segmentations]
+        rounded = max(signal.rounding_variance / signal.rate for signal in signals)
+        known = getattr(noise, name)
+        density = 0.0 if known is None else float(known.white.mean())
+        ratio = np.sqrt(density / (np.mean([part[name] for part in seen]) + rounded))
+        if density > 0 and not 1 / _HAND < ratio < _NOISIER:
+            yield (
+                f"{name}: the noise that is stated, or shown by the recording at rest, is {ratio:.2g} times what the "
+                "rests of this log show: a wrong unit of its columns, another device, or a table that shook. The "
+                "uncertainties follow it; leave it out, or mend it."
+            )
 
 
 def _of_ready(ready: Prepared) -> NoiseModel:
@@ -57,6 +91,10 @@ def _of_ready(ready: Prepared) -> NoiseModel:
         if not (np.ptp(whole, axis=1) > 0).all():
             raise NotPossibleError(f"{what} has an axis that never changes: there is no noise to model.")
         for axis in whole:
+            axis[:], steps = without_steps(axis, rate)
+            if steps:
+                times = listed([f"{step.time:.4g} s" for step in steps])
+                notes.append(f"{what} has steps of its level in the recording at rest, after {times}: taken out.")
             lines, _, periodic = periodic_lines(axis, rate)
             if periodic is not None:
                 axis -= periodic

@@ -1,4 +1,4 @@
-"""What does not belong to the noise of a sensor at rest: outliers, gaps and periodic lines, found and taken out."""
+"""What is no noise of a sensor at rest: outliers, gaps, steps of its level and periodic lines, found and taken out."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from jaximu.ground.array_types import FloatArray, IntArray
-from jaximu.ground.distributions import robust_sigma
+from jaximu.ground.distributions import normal_isf, robust_sigma
 from jaximu.recordings.recording import runs_of
 
 BRIDGED = 5
@@ -21,6 +21,12 @@ _SPIKE = 8.0
 FALSE_LINE = 1e-6
 """Probability that noise alone shows a line somewhere on an axis."""
 _MOST_LINES = 20
+_MEANS, _SHORTEST_MEAN = 200, 8
+"""Means over a recording between which a step of the level shows, and samples in each at the least."""
+_NEAR = 6
+"""Means to each side among which a step stands out alone: a warm-up's changes are alike there."""
+_MOST_STEPS = 5
+"""Steps that are single events; more of them are the noise of the sensor."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +71,72 @@ def without_outliers(values: FloatArray) -> tuple[FloatArray, int]:
         values = values.copy()
         values[far] = np.nan
     return values, len(far)
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of the level that was taken out: seconds after the first sample, and size (signal unit)."""
+
+    time: float
+    size: float
+
+
+def without_steps(values: FloatArray, rate: float) -> tuple[FloatArray, tuple[Step, ...]]:
+    """Return the samples (n,) less the steps of their level, in the order of time.
+
+    Where a step is, means over a two-hundredth of the recording on both sides of one such part differ by more than any
+    two others do by chance, drift and walk included, and by more than those nearby.
+    """
+    size = len(values) // _MEANS
+    level, steps = values, list[Step]()
+    limit = float(normal_isf(FALSE_LINE / (2 * _MEANS)))
+    while size >= _SHORTEST_MEAN:
+        means = _block_means(level, size)
+        change = _changes(means, 1)
+        at = int(abs(change).argmax())  # the mean before the one in which it steps
+        near = np.concatenate([change[max(0, at - _NEAR) : max(0, at - 1)], change[at + 2 : at + _NEAR + 1]])
+        usual = robust_sigma(change)
+        if not abs(change[at]) > limit * max(usual, np.sqrt(np.mean(near**2))) or not 2 < at < _MEANS - _NEAR:
+            break
+        if usual == 0 or len(steps) == _MOST_STEPS:
+            return values, ()
+        off = (level[at * size : (at + 3) * size] - (means[at] + means[at + 2]) / 2) * np.sign(change[at])
+        first = at * size + int(np.nancumsum(off).argmin()) + 1
+        spans = {
+            span: _changes(means, span) for span in (2 ** np.arange(7)).tolist() if span - 1 <= at < _MEANS - span - 1
+        }
+        span = min(spans, key=lambda span: robust_sigma(spans[span]))  # white noise wants long means, a walk short ones
+        step = float(spans[span][at - span + 1])
+        level = level - step * (np.arange(len(level)) >= first)
+        steps.append(Step(first / rate, step))
+    return level, tuple(sorted(steps, key=lambda step: step.time))
+
+
+def _block_means(values: FloatArray, size: int) -> FloatArray:
+    """Return means (`_MEANS`,) of so many samples; a straight line over those that are missing altogether."""
+    blocks = values[: size * _MEANS].reshape(_MEANS, size)
+    there = np.isfinite(blocks)
+    count = there.sum(axis=1)
+    means = np.where(there, blocks, 0.0).sum(axis=1) / np.maximum(1, count)
+    index = np.arange(_MEANS)
+    return np.interp(index, index[count > 0], means[count > 0])
+
+
+def _changes(means: FloatArray, span: int) -> FloatArray:
+    """Return by how much the mean of `span` means is above that of as many before, one between them left out."""
+    total = np.cumulative_sum(means, include_initial=True)
+    sums = total[span:] - total[:-span]
+    return (sums[span + 1 :] - sums[: -span - 1]) / span
+
+
+def fillable(values: FloatArray) -> slice:
+    """Return the longest part of samples (n,) without a gap that is longer than what lies before it in the part."""
+    parts, first = [], 0
+    for start, stop in runs_of(np.isnan(values)):
+        if stop - start > start - first:
+            parts.append(slice(first, start))
+            first = stop
+    return max((*parts, slice(first, len(values))), key=lambda part: part.stop - part.start)
 
 
 def filled(values: FloatArray, longest: int | None = None) -> FloatArray:

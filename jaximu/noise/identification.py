@@ -28,7 +28,18 @@ from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.vectors import sigmas_of, submatrix
 from jaximu.model.processes import MEMBER_VARIANCE, TERM_PROCESSES, BiasInstability, FirstOrderGaussMarkov
-from jaximu.noise.cleaning import BRIDGED, PeriodicLine, filled, lowest, periodic_lines, without_line, without_outliers
+from jaximu.noise.cleaning import (
+    BRIDGED,
+    PeriodicLine,
+    Step,
+    fillable,
+    filled,
+    lowest,
+    periodic_lines,
+    without_line,
+    without_outliers,
+    without_steps,
+)
 from jaximu.noise.deviations import Deviation, averaging_factors, deviation, require_samples
 
 TERMS = "QNBKR"
@@ -86,9 +97,9 @@ class Identified:
 
     misfit: χ² of the fit, octave by octave of frequency, and its degrees of freedom. excess: where χ² is far too large,
     the share by which the spectrum of each octave is let differ from the terms (a correlated process, a filter, a drift
-    beside them), which widens intervals. lines, warm_up and outliers (a number of samples) were found first and taken
-    out of the samples, of the deviation too. high_pass: time constant (s) of what took out what is slow before it was
-    logged; the terms are those before it. gauss_markov: those asked for. limits: how large the terms that are not
+    beside them), which widens intervals. lines, warm_up, steps and outliers (a number of samples) were found first and
+    taken out of the samples, of the deviation too. high_pass: time constant (s) of what took out what is slow before it
+    was logged; the terms are those before it. gauss_markov: those asked for. limits: how large the terms that are not
     supported could be beside those that are (SI, the upper end of a two-sided interval).
     """
 
@@ -100,6 +111,7 @@ class Identified:
     lines: tuple[PeriodicLine, ...] = ()
     warm_up: WarmUp | None = None
     outliers: int = 0
+    steps: tuple[Step, ...] = ()
     high_pass: Term | None = None
     gauss_markov: tuple[GaussMarkov, ...] = ()
 
@@ -165,7 +177,9 @@ def _identify(
     if np.ptp(values[there]) == 0:
         raise NotPossibleError(_CONSTANT)
     values = values[there[0] : there[-1] + 1]
+    values = values[fillable(values)]
     values, outliers = without_outliers(values)
+    values, steps = without_steps(values, rate)
     whole = filled(values)  # for the spectrum; the deviation leaves long gaps out
     lines, bands, periodic = periodic_lines(whole, rate, highest)
     if highest is not None:
@@ -208,7 +222,7 @@ def _identify(
     )
     limits = {term: _limit(best, term, threshold) for term in offered if result[term] is None}
     quality = replace(best, model=replace(best.model, excess=0.0)).misfit()
-    return Identified(result, measured, quality, limits, excess, lines, warm_up, outliers, high_pass, processes)
+    return Identified(result, measured, quality, limits, excess, lines, warm_up, outliers, steps, high_pass, processes)
 
 
 def _deviation(values: FloatArray, rate: float, confidence: float) -> Deviation:

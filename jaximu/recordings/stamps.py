@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import scipy
 
@@ -16,6 +18,30 @@ _SPAN = 32
 _BESIDE = 20
 """Samples before and after an interval whose lateness is compared where stamps jitter."""
 _ROUNDS = 16
+_BLOCK, _FEWEST_BLOCKS, _OTHER = 51, 3, 0.2
+"""Intervals whose median is looked at (an odd number), blocks of them that a rate lasts, and the logarithm by which
+another rate is off."""
+_MOST_EVEN = 0.9  # share of the intervals that are about their median where a rate is kept
+
+
+def stretches_of_one_rate(time: FloatArray) -> list[slice]:
+    """The stretches of stamps (n,) between which a logger changes its rate and keeps it; all of any others."""
+    whole, interval = [slice(0, len(time))], np.diff(time)
+    blocks = len(interval) // _BLOCK
+    usual = np.median(interval[: blocks * _BLOCK].reshape(blocks, _BLOCK), axis=1)
+    if blocks < 2 * _FEWEST_BLOCKS or not (usual > 0).all():
+        return whole
+    edges = [0]
+    for block in np.flatnonzero(np.abs(np.diff(np.log(usual))) > _OTHER) + 1:
+        around = interval[(block - 1) * _BLOCK : (block + 1) * _BLOCK]
+        nearer = np.abs(around - usual[block - 1]) - np.abs(around - usual[block])  # to the rate after the change
+        edges.append((block - 1) * _BLOCK + int(nearer.cumsum().argmin()) + 1)
+    stretches = [slice(*pair) for pair in pairwise([*edges, len(time)])]
+    for part in stretches:
+        here = np.diff(time[part])
+        if len(here) < _FEWEST_BLOCKS * _BLOCK or (np.abs(here / np.median(here) - 1) < _OTHER).mean() < _MOST_EVEN:
+            return whole
+    return stretches
 
 
 def missing_samples(time: FloatArray) -> FloatArray:
