@@ -17,6 +17,7 @@ from jaximu.mistakes import inspect, prepare
 from jaximu.recordings.alignment import carried
 from jaximu.recordings.readers import ReadOptions, advise_reading, read_recording
 from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.segmentation import segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld, Static
 
@@ -446,8 +447,15 @@ def test_sections_put_together_are_not_two_devices(tmp_path):
     within = values[:, 0] % 3.0  # rests of two seconds, turns of one
     rests = values[(within > 0.2) & (within < 1.8)][:, 1:]
     log = save(tmp_path / "log.csv", HEAD, *lines(rests))
-    names = {finding.name for finding in inspect(read_recording(log, options=ReadOptions(rate=50.0)))}
-    assert not names & {"data.mixed_devices", "data.range"}
+    recording = read_recording(log, options=ReadOptions(rate=50.0))
+    assert not {finding.name for finding in inspect(recording)} & {"data.mixed_devices", "data.range"}
+    calibration, alone = calibrate(recording), calibrate(recording, method="accelerometer")
+    assert any("their motion is not in the log" in note for note in calibration.notes)
+    assert {name.owner for name in calibration.open_numbers} == {"gyroscope"}
+    np.testing.assert_allclose(calibration.imu.accelerometer.gain, alone.imu.accelerometer.gain, atol=1e-4)
+    whole = by_hand()
+    gyroscope = replace(whole.gyroscope, values=whole.gyroscope.values / 5)  # one that reads a fifth turns all the same
+    assert not segment(replace(whole, gyroscope=gyroscope)).torn
 
 
 # --- other languages, and what stands between the rows

@@ -43,7 +43,8 @@ def require_carried(error: float, where: str) -> None:
         raise NotPossibleError(
             f"{where}: no gyroscope explains the turns: gravity carried over them is still off by {error:.0f}° (rms) "
             "after the fit. Check the gyroscope's scale or unit (--gyro-scale, --columns), its axes (--axes) and "
-            "its clock; or leave its columns out (_ in --columns)."
+            "its clock, and whether motion between the poses was cut out or the accelerometer smoothed; or leave the "
+            "gyroscope out (--method accelerometer)."
         )
 
 

@@ -693,14 +693,17 @@ def _no_gravity(signal: Signal) -> bool:
 
 
 def _gyro_advice(gyroscope: Signal, ratio: float) -> str:
-    return "check --gyro-scale" if gyroscope.unit == "count" else _unit_advice(ratio, _GYRO_SLIPS)
+    otherwise = "no unit makes this factor: check --columns, and whether one of the two sensors was smoothed"
+    return "check --gyro-scale" if gyroscope.unit == "count" else _unit_advice(ratio, _GYRO_SLIPS, otherwise)
 
 
-def _unit_advice(ratio: float, slips: Mapping[str, float]) -> str:
+def _unit_advice(
+    ratio: float, slips: Mapping[str, float], otherwise: str = "check the unit in the column name or in --columns"
+) -> str:
     """What the column is likely to be in, when true = ratio · stated."""
     nearest, off = likeliest(ratio, slips)
     if off > np.log(1.6):
-        return "check the unit in the column name or in --columns"
+        return otherwise
     return f"these columns look like {nearest}: change the unit in the header or with --columns"
 
 

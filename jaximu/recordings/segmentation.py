@@ -29,6 +29,7 @@ _PARTS = 4  # of a turn, over each of which slow bias is taken as constant
 _SHORTEST = 0.25  # s; what is correlated over less than this is white noise to poses and turns
 _ONSET = np.radians(100.0)  # rad/s³; the rate of a quarter turn in three seconds grows by so much times t² at first
 _CHANCE = 3.0  # standard deviations
+_TORN = 10.0  # times what the gyroscope shows, that gravity cannot turn by
 _BRIDGED = 3e-4  # rad; error that a gap may bring into a turn
 _LONGEST_TURN = 60.0  # s; beyond it, gyroscope drift tells more about itself than about the gain
 _STOP_WINDOW, _LEAST_OF_STOP = 1.0, 1.0  # s; and what a stop must have left beside half a window at either end
@@ -59,7 +60,7 @@ class Segmentation(Comparable):
     """Poses found in one recording, and how.
 
     intervals: (P, 2) start and stop (s, on the recording's clock). threshold: the factor used. tried: by factor the
-    number of intervals. notes: sentences for the user.
+    number of intervals. notes: sentences for the user. torn: numbers of turns whose motion is not in the recording.
     """
 
     recording: Recording
@@ -67,6 +68,7 @@ class Segmentation(Comparable):
     threshold: float
     tried: Mapping[float, int]
     notes: tuple[str, ...]
+    torn: tuple[int, ...] = ()
 
     def table(self) -> str:
         """Say in one line how many intervals each threshold gave."""
@@ -204,7 +206,33 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
             f"{recording.name}: {_why_no_poses(results[chosen][0], centres[-1] - centres[0], means[0], notes)}"
         )
     tried = dict(zip(factors, counts, strict=True))
-    return Segmentation(recording, intervals, float(factors[chosen]), tried, tuple(notes))
+    torn, remarks = ((), ()) if gyroscope is None else _torn(scan.moments, gyroscope, intervals)
+    return Segmentation(recording, intervals, float(factors[chosen]), tried, (*notes, *remarks), torn)
+
+
+def _torn(
+    moments: Sequence[Moments], gyroscope: Signal, intervals: FloatArray
+) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Which turns' motion is not in the log, and what is said of it: gravity turns by far more than the gyroscope.
+
+    Where only some turns are so, samples were lost in them, which is looked for by a fit.
+    """
+    force, rate = (running.between(*intervals.T)[0] for running in moments)
+    gravity = _angles(force[:-1], force[1:])
+    shown = np.cumulative_sum(
+        lengths_of(gyroscope.si() - np.median(rate, axis=0)) * np.diff(gyroscope.edges), include_initial=True
+    )
+    between = gyroscope.time.searchsorted(intervals.ravel()[1:-1].reshape(-1, 2))
+    path = np.diff(shown[between])[:, 0]
+    torn, turned = gravity > _TORN * path + _DISTINCT, gravity > _DISTINCT
+    if torn.sum() <= turned.sum() / 2:
+        return (), ()
+    return tuple(np.flatnonzero(torn).tolist()), (
+        f"gravity turns by up to {np.degrees(gravity[torn].max()):.0f}° from pose to pose where the gyroscope shows "
+        f"{np.degrees(path[torn].max()):.2g}° at most, in {torn.sum()} of {turned.sum()} turns: their motion is not in "
+        "the log, as where poses were recorded apart and put together. These turns are left out. Log everything from "
+        "the first pose to the last.",
+    )
 
 
 def find_stops(recording: Recording) -> Segmentation | None:
@@ -484,7 +512,8 @@ def observed_poses(
             first_rest = middle if first_rest is None else first_rest
             shift = middle - first_rest
             rate = rate - shift
-            between = _turns(gyroscope, intervals, shift)
+            turned = _turns(gyroscope, intervals, shift)
+            between = [_NO_TURN if at in part.torn else turn for at, turn in enumerate(turned)]
         rests.append(
             {
                 "accelerometer_mean": force,

@@ -32,7 +32,7 @@ def stretches_of_one_rate(time: FloatArray) -> list[slice]:
     if blocks < 2 * _FEWEST_BLOCKS or not (usual > 0).all():
         return whole
     edges = [0]
-    for block in np.flatnonzero(np.abs(np.diff(np.log(usual))) > _OTHER) + 1:
+    for block in (np.flatnonzero(np.abs(np.diff(np.log(usual))) > _OTHER) + 1).tolist():
         around = interval[(block - 1) * _BLOCK : (block + 1) * _BLOCK]
         nearer = np.abs(around - usual[block - 1]) - np.abs(around - usual[block])  # to the rate after the change
         edges.append((block - 1) * _BLOCK + int(nearer.cumsum().argmin()) + 1)
