@@ -15,6 +15,7 @@ from jaximu.acceptance.item import Item, deciding
 from jaximu.acceptance.limits import FROM_ALLAN, OF_ONE_UNIT, OUTPUTS, Limit, Limits
 from jaximu.acceptance.navigation import navigation_items
 from jaximu.acceptance.quantities import Measured, Units, measure, of_calibration
+from jaximu.acceptance.words import parts_of
 from jaximu.calibration import Calibration
 from jaximu.estimation.problem import flatten, names_of, typical_sizes
 from jaximu.estimation.uncertainty import pose_advice, station_advice
@@ -23,6 +24,7 @@ from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import FilePath
 from jaximu.ground.page import Result
 from jaximu.ground.quantities import Z95
+from jaximu.ground.vectors import root_or_zero
 
 SCHEMA = "jaximu.acceptance/1"
 _TERM = ("value", "low", "high")
@@ -81,8 +83,8 @@ class Judged:
 
     def result(self, row: int, index: int) -> Json:
         """Return what an item of a unit says of its value."""
-        arrays = {key: getattr(self.measured, key) for key in ("value", "sigma", "freedom")}
-        numbers = {key: float(array[row, self.places[index]]) for key, array in arrays.items()}
+        at = row, self.places[index]
+        numbers = {key: float(getattr(self.measured, key)[at]) for key in ("value", "sigma", "freedom")}
         return numbers | {"probability": float(self.probability[row, index]), "verdict": str(self.verdict[row, index])}
 
 
@@ -93,25 +95,23 @@ def judge(units: Units, limits: Limits) -> Judged:
     measured = measure(units, limits.nominal, outputs)
     first = len(measured.names) - 3 * len(outputs)
     questions = []
-    named = {(limit.owner, limit.part, limit.axes) for limit in limits.limits}
     for limit in limits.limits:
         if limit.part in OF_ONE_UNIT:
             continue
-        stem = limit.stem
         if limit in outputs:
             start = first + 3 * outputs.index(limit)
             columns = {(axis,): start + axis for axis in range(3)}
         else:
             columns = {
-                tuple(map(int, name.partition("[")[2].rstrip("]").split(","))): column
-                for column, name in enumerate(measured.names[:first])
-                if name.partition("[")[0] == stem and limit.owner in held
+                named.axes: column
+                for column, named in enumerate(map(parts_of, measured.names[:first]))
+                if named.stem == limit.stem and limit.owner in held
             }
         for axes, column in columns.items():
-            applies = limit.axes == axes or (not limit.axes and (limit.owner, limit.part, axes) not in named)
+            name = f"{limit.stem}[{','.join(map(str, axes))}]"
             # the convention's zeros are no result; who names one is told so
-            if applies and (limit.axes or limit in outputs or not measured.fixed[column]):
-                questions.append((limit, f"{stem}[{','.join(map(str, axes))}]", column))
+            if limits.applies(limit, name) and (limit.axes or limit in outputs or not measured.fixed[column]):
+                questions.append((limit, name, column))
         if not columns or (limit.axes and limit.axes not in columns):
             questions.append((limit, limit.key, -1))
     indices = [column for _, _, column in questions]
@@ -199,12 +199,12 @@ def _item(calibration: Calibration, units: Units, limits: Limits, judged: Judged
     calibrated = calibration.data.get("temperature_range")
     warm = limit.temperature
     reason = _not_stated(limit, units, limits)
+    if not reason and at < 0:
+        reason = "the calibration has no such axis"
+    elif not reason and measured.fixed[at]:
+        reason = "this entry is zero by convention, which fixes the body frame"
     if reason:
         return Item.of(limit, name, reason=reason)
-    if at < 0:
-        return Item.of(limit, name, reason="the calibration has no such axis")
-    if measured.fixed[at]:
-        return Item.of(limit, name, reason="this entry is zero by convention, which fixes the body frame")
     record = _record(calibration, units, measured.slope[0, at])
     if not measured.determined[0, at]:
         return Item.of(limit, name, reason="the recording does not determine it", advice=record)
@@ -212,7 +212,7 @@ def _item(calibration: Calibration, units: Units, limits: Limits, judged: Judged
         beyond = f"{calibrated[0]:.1f} to {calibrated[1]:.1f} °C that were calibrated"
         return Item.of(limit, name, reason=f"the limit's temperatures go beyond the {beyond}")
     result, gravity, advice = judged.result(0, index), float(measured.gravity[0, at]), ""
-    recording = float(np.sqrt(max(result["sigma"] ** 2 - gravity**2, 0.0)))
+    recording = float(root_or_zero(result["sigma"] ** 2 - gravity**2))
     if result["verdict"] == UNDECIDED:
         needed = limit.nearest(result["value"]) / float(limits.rule.multiple(result["freedom"]))
         advice = deciding(needed, recording, gravity, calibration.gravity.sigma, record)

@@ -18,6 +18,7 @@ import numpy as np
 
 from jaximu.acceptance.limits import Scales
 from jaximu.acceptance.quantities import measure, of_calibration
+from jaximu.acceptance.words import parts_of
 from jaximu.calibration import Calibration
 from jaximu.estimation.fitting import effect_numbers
 from jaximu.estimation.problem import Name, without_equipment_or_effects
@@ -69,10 +70,16 @@ class Epoch:
         return float(np.sqrt(slope @ self.covariance @ slope + gravity * (slope @ self.by_gravity) ** 2))
 
 
+def without_gravity(calibration: Calibration) -> Calibration:
+    """Return a calibration without the part of its covariance that is gravity's."""
+    shift = calibration.gravity_shift()
+    return replace(calibration, covariance=calibration.covariance - np.outer(shift, shift))
+
+
 def owner_of(name: str) -> str:
     """Return the triad that a quantity is of: `gyroscope.bias[2]`, `accel.temperature[0]`."""
-    stem = name.partition("[")[0]
-    return CATALOGUE[stem].owner if stem in CATALOGUE else stem.partition(".")[0]
+    stem, owner, *_ = parts_of(name)
+    return CATALOGUE[stem].owner if stem in CATALOGUE else owner
 
 
 def in_own_axes(calibration: Calibration) -> tuple[Calibration, bool]:
@@ -111,8 +118,8 @@ def epochs_of(calibrations: Sequence[Calibration], files: Sequence[str], nominal
     """
     pairs = [in_own_axes(calibration) for calibration in calibrations]
     common = _temperatures([calibration for calibration, _ in pairs], files)
-    first = pairs[0][0].triads()
-    scales = {name: (np.diagonal(triad.gain), triad.bias) for name, triad in first.items()} | dict(nominal)
+    first = pairs[0][0].triads().items()
+    scales = {name: (np.diagonal(triad.gain), triad.bias) for name, triad in first} | dict(nominal)
     return [
         _epoch(*_at_temperatures(calibration, common), file, turned, scales)
         for (calibration, turned), file in zip(pairs, files, strict=True)
@@ -121,10 +128,9 @@ def epochs_of(calibrations: Sequence[Calibration], files: Sequence[str], nominal
 
 def _epoch(calibration: Calibration, reasons: Mapping[str, str], file: str, turned: bool, scales: Scales) -> Epoch:
     measured = measure(of_calibration(calibration), scales, ())
-    by_gravity = calibration.gravity_shift()
     quantities = {}
     for column, name in enumerate(measured.names):
-        stem = name.partition("[")[0]
+        stem = parts_of(name).stem
         owner = owner_of(name)
         if owner not in calibration.triads() or (stem in CATALOGUE and CATALOGUE[stem].scope != "device"):
             continue
@@ -134,9 +140,8 @@ def _epoch(calibration: Calibration, reasons: Mapping[str, str], file: str, turn
         elif not measured.determined[0, column]:
             unless = f"{file} does not determine all of that"
         quantities[name] = Measurand(float(measured.value[0, column]), measured.slope[0, column], unless)
-    return Epoch(
-        file, calibration, turned, calibration.covariance - np.outer(by_gravity, by_gravity), by_gravity, quantities
-    )
+    covariance = without_gravity(calibration).covariance
+    return Epoch(file, calibration, turned, covariance, calibration.gravity_shift(), quantities)
 
 
 # --- temperature ------------------------------------------------------------------------------------------------------
@@ -144,8 +149,11 @@ def _epoch(calibration: Calibration, reasons: Mapping[str, str], file: str, turn
 
 def over_temperature(calibration: Calibration) -> set[str]:
     """Return the triads that have an effect of temperature."""
-    triads = calibration.triads().items()
-    return {name for name, triad in triads if any("temperature" in effect.needs for effect in triad.effects)}
+    return {
+        name
+        for name, triad in calibration.triads().items()
+        if any("temperature" in effect.needs for effect in triad.effects)
+    }
 
 
 def _temperatures(calibrations: Sequence[Calibration], files: Sequence[str]) -> dict[str, float]:

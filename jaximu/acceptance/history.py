@@ -24,7 +24,7 @@ from jaximu.acceptance.epochs import Epoch, epochs_of, over_temperature, owner_o
 from jaximu.acceptance.limits import OF_ONE_UNIT, OUTPUTS, Limit, Limits, Scales
 from jaximu.acceptance.quantities import output_stimulus
 from jaximu.acceptance.trend import Sameness, StraightLine, sameness
-from jaximu.acceptance.words import si_unit
+from jaximu.acceptance.words import parts_of, si_unit
 from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import require_calibration
 from jaximu.estimation.problem import flatten, names_of
@@ -79,8 +79,10 @@ class Movement:
 
     def document(self, per: str) -> Json:
         """Return it as JSON has it; `per`: unit of time."""
-        names = ("name", "unit", "values", "sigmas", "difference", "sigma", "z", "p_value", "moved", "tested")
-        return entries(self, *names) | {
+        plain = entries(
+            self, "name", "unit", "values", "sigmas", "difference", "sigma", "z", "p_value", "moved", "tested"
+        )
+        return plain | {
             "p_value_all_allowed_for": self.adjusted if self.tested else None,
             "drift": self.line.document() | {"unit": f"{self.unit} per {per}"},
         }
@@ -138,8 +140,8 @@ class UnitHistory(Result, Document, page="history"):
     @property
     def moved(self) -> tuple[Movement, ...]:
         """The numbers that moved, the surest first."""
-        surest = sorted(self.movements, key=lambda movement: movement.p_value)
-        return tuple(movement for movement in surest if movement.moved)
+        moved = (movement for movement in self.movements if movement.moved)
+        return tuple(sorted(moved, key=lambda movement: movement.p_value))
 
     @property
     def verdict(self) -> str:
@@ -288,7 +290,7 @@ def _comparable(epochs: Sequence[Epoch]) -> tuple[list[str], list[str]]:
     names = []
     left_out = {}
     for name in dict.fromkeys(name for epoch in epochs for name in epoch.quantities):
-        stem = name.partition("[")[0]
+        stem = parts_of(name).stem
         owner = owner_of(name)
         lacking = [epoch.file for epoch in epochs if name not in epoch.quantities]
         unless = [epoch.quantities[name].unless for epoch in epochs if name in epoch.quantities]
@@ -318,10 +320,10 @@ def _comparable(epochs: Sequence[Epoch]) -> tuple[list[str], list[str]]:
 
 def _not_compared(left_out: Mapping[str, str], names: Sequence[str]) -> list[str]:
     """Return what is left out in sentences, one for each reason; axes stand together where none is compared."""
-    stems = {name.partition("[")[0] for name in names}
+    stems = {parts_of(name).stem for name in names}
     by_reason = {}
     for what, why in left_out.items():
-        stem = what.partition("[")[0]
+        stem = parts_of(what).stem
         by_reason.setdefault(why, {})[what if stem in stems else stem] = None
     return [f"not compared: {listed([*whats])}, because {why}." for why, whats in by_reason.items()]
 
@@ -399,7 +401,7 @@ def _courses(
 
 
 def _unit(name: str, calibration: Calibration) -> str:
-    stem = name.partition("[")[0]
+    stem = parts_of(name).stem
     if stem not in CATALOGUE:
         return si_unit(name)
     return CATALOGUE[stem].coefficient_unit(calibration.triads()[owner_of(name)].output_unit)
@@ -407,11 +409,8 @@ def _unit(name: str, calibration: Calibration) -> str:
 
 def _kind(name: str) -> str:
     """Return which numbers one is tested with: a triad's bias, its gain, or effects."""
-    stem = name.partition("[")[0]
-    if stem in CATALOGUE:
-        return "effects"
-    owner, _, part = stem.partition(".")
-    return f"{owner} {'bias' if part == 'bias' else 'gain'}"
+    stem, owner, part, _ = parts_of(name)
+    return "effects" if stem in CATALOGUE else f"{owner} {'bias' if part == 'bias' else 'gain'}"
 
 
 def _together(movements: Sequence[Movement], values: FloatArray, covariance: FloatArray) -> dict[str, Sameness]:
@@ -437,14 +436,14 @@ def _outputs(first: Epoch, last: Epoch, names: Sequence[str], rate: float) -> tu
     changes = {}
     silent = []
     for owner in dict.fromkeys(map(owner_of, names)):
-        needed = [
+        missing = [
             name
             for epoch in (first, last)
             for name, quantity in epoch.quantities.items()
-            if name.startswith(f"{owner}.") and quantity.unless != "fixed"
+            if name.startswith(f"{owner}.") and quantity.unless != "fixed" and name not in names
         ]
         try:
-            if missing := [name for name in needed if name not in names]:
+            if missing:
                 raise InputError(f"{missing[0]} is not known in both.")
             effects = [effect for epoch in (first, last) for effect in epoch.calibration.imu.triads()[owner].effects]
             if (first.turned or last.turned) and any(map(_has_axes, effects)):

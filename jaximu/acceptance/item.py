@@ -50,8 +50,7 @@ class Item:
 
     def document(self) -> Json:
         """Return the item as JSON has it; uncertainty is expanded, k = 2."""
-        names = ("name", "value", "unit", "verdict", "probability", "source", "reason", "advice")
-        return entries(self, *names) | {
+        return entries(self, "name", "value", "unit", "verdict", "probability", "source", "reason", "advice") | {
             "uncertainty": None if self.sigma is None else 2 * self.sigma,
             "low": _finite(self.low),
             "high": _finite(self.high),

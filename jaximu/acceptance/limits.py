@@ -39,7 +39,7 @@ from typing import Any
 import numpy as np
 
 from jaximu.acceptance.decision import Rule, probability_of_conformity
-from jaximu.acceptance.words import between
+from jaximu.acceptance.words import between, parts_of
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import Json, file_digest, read_toml
 from jaximu.ground.errors import FilePath, InputError, only
@@ -62,7 +62,7 @@ OF_ONE_UNIT = (*FROM_ALLAN, *_NAVIGATION)
 OUTPUTS = ("output", "raw_output")
 _PARTS = ("bias", "scale", "misalignment", *OUTPUTS, "repeatability")
 _LONGEST = 3600.0  # s, of navigation
-_KEY = re.compile(r"([a-z_.A-Z]+?)(?:\[(\d)(?:,\s*(\d))?\])?")
+_KEY = re.compile(r"[a-z_.A-Z]+(?:\[\d(?:,\s*\d)?\])?")
 _KEYS = ("within", "low", "high", "typical", "source", "over", "temperature", "after")
 _TOP = ("rule", "risk", "source", "limits", "nominal")
 
@@ -121,12 +121,9 @@ class Limits:
 
     def applies(self, limit: Limit, name: str) -> bool:
         """Return whether a limit is the one of a quantity such as `gyroscope.bias[2]`: one of its axis goes before."""
-        stem, _, axes = name.rstrip("]").partition("[")
-        if stem != limit.stem:
-            return False
-        named = tuple(map(int, axes.split(",")))
+        stem, _, _, axes = parts_of(name)
         others = [other.axes for other in self.limits if other.stem == stem]
-        return limit.axes == named or (not limit.axes and named not in others)
+        return limit.stem == stem and (limit.axes == axes or (not limit.axes and axes not in others))
 
 
 def read_limits(path: FilePath, rule: str | None = None, risk: float | None = None) -> Limits:
@@ -197,10 +194,7 @@ def _limit(key: str, stated: Any, source: str, where: str) -> Limit:
 
 
 def _meaning(key: str, where: str) -> tuple[str, str, tuple[int, ...], str]:
-    match = _KEY.fullmatch(key)
-    name = match[1] if match else ""
-    axes = tuple(int(digit) for digit in match.groups()[1:] if digit) if match else ()
-    owner, _, part = name.partition(".")
+    name, owner, part, axes = parts_of(key if _KEY.fullmatch(key) else "")
     if name in CATALOGUE:
         effect = CATALOGUE[name]
         if effect.scope != "device" or len(axes) > 1 or (axes and axes[0] >= effect.size):

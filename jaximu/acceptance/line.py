@@ -30,7 +30,7 @@ from jaximu.acceptance.statistics import (
     tolerance_factor,
     with_ends,
 )
-from jaximu.acceptance.words import amount, si_unit, spoken
+from jaximu.acceptance.words import amount, parts_of, si_unit, spoken
 from jaximu.fleets.population import FEWEST, LEVEL, days_of, read_fleet
 from jaximu.fleets.rows import COLUMN_PLACES, PARAMETERS, covariances, free_places, require_table
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
@@ -314,12 +314,10 @@ def population_limits(path: FilePath, rule: Rule) -> Limits:
         if measured.fixed[index]:
             continue
         values = measured.value[kept, index]
-        stem, _, axes = name.rstrip("]").partition("[")
-        owner, _, part = stem.partition(".")
+        _, owner, part, axes = parts_of(name)
         middle = float(np.mean(values))
         half = factor * float(np.std(values, ddof=1))
-        axis = tuple(map(int, axes.split(",")))
-        limits.append(Limit(name, owner, part, axis, middle - half, middle + half, si_unit(name), source))
+        limits.append(Limit(name, owner, part, axes, middle - half, middle + half, si_unit(name), source))
     return Limits(tuple(limits), rule, nominal, table.file, file_digest(path))
 
 
@@ -488,9 +486,8 @@ def write_verdicts(line: Line, path: FilePath) -> None:
     """
     table = pq.read_table(line.table.file)
     table = table.drop_columns([name for name in ("acceptance", "not_passed") if name in table.column_names])
-    missed: list[list[str]] = [[] for _ in range(line.table.total)]
-    for index, row in enumerate(line.table.rows.tolist()):
-        missed[row] = line.missed(index)
+    by_row = {row: line.missed(index) for index, row in enumerate(line.table.rows.tolist())}
+    missed = [by_row.get(row, []) for row in range(line.table.total)]
     table = table.append_column("acceptance", pa.array(line.verdicts.tolist(), pa.string()))
     table = table.append_column("not_passed", pa.array(missed, pa.list_(pa.string())))
     with atomic_write(path) as temporary:

@@ -8,17 +8,18 @@ probability of conformity is that of an error within the limits.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from jaximu.acceptance.decision import UNDECIDED, Rule
+from jaximu.acceptance.epochs import without_gravity
 from jaximu.acceptance.item import Item, deciding
 from jaximu.acceptance.limits import Limit
 from jaximu.calibration import Calibration
 from jaximu.ground.distributions import normal_isf
 from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.vectors import root_or_zero
 from jaximu.navigation.consequences import consequences
 from jaximu.navigation.trajectory import Place, level_driving
 from jaximu.noise.stated import sensor_noise
@@ -37,8 +38,6 @@ def navigation_items(
     notes = []
     known = None if noise is None else sensor_noise(noise, "the allan.json")
     site = Place(_LATITUDE, 0.0, calibration.gravity)
-    by_gravity = calibration.gravity_shift()
-    gravity_known = replace(calibration, covariance=calibration.covariance - np.outer(by_gravity, by_gravity))
     for after in dict.fromkeys(limit.after for limit in limits):
         here = [limit for limit in limits if limit.after == after]
         try:
@@ -46,7 +45,7 @@ def navigation_items(
         except NotPossibleError as error:
             items += [Item.of(limit, limit.key, reason=str(error).rstrip(".")) for limit in here]
             continue
-        exact = consequences(gravity_known, level_driving(site, after), draws=0, files=(file, ""))
+        exact = consequences(without_gravity(calibration), level_driving(site, after), draws=0, files=(file, ""))
         errors = [  # of position, and of the rotation about the vertical
             (np.sqrt(variances[-1, :3]), np.degrees(np.sqrt(variances[-1, -1:])))
             for variances in (outcome.calibration, exact.calibration, outcome.noise)
@@ -56,7 +55,7 @@ def navigation_items(
             for axis in limit.axes or range(len(parts[0])):
                 name = f"navigation.{limit.part}" + (f"[{axis}]" if limit.part == "position" else "")
                 total, recording, rest = (float(sigma[axis]) for sigma in parts)
-                of_gravity = float(np.sqrt(max(total**2 - recording**2, 0.0)))
+                of_gravity = float(root_or_zero(total**2 - recording**2))
                 items.append(_item(limit, name, rule, recording, of_gravity, rest, calibration.gravity.sigma))
         notes.append(f"{', '.join(limit.key for limit in here)}: after {outcome.trajectory.words}.")
         notes += [] if known else [f"{here[0].key}: without --noise the sensors' noise is left out."]

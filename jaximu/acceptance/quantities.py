@@ -24,6 +24,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from jaximu.acceptance.limits import Limit, Scales
+from jaximu.acceptance.words import parts_of
 from jaximu.calibration import Calibration
 from jaximu.estimation.problem import Name, flatten, names_of, typical_sizes, unflatten
 from jaximu.estimation.projection import output_error
@@ -86,20 +87,20 @@ def of_calibration(calibration: Calibration) -> Units:
     names = calibration.names
     data = calibration.data
     excess = calibration.excess
-    numbers = {owner: sum(name.owner == owner for name in names) for owner in SENSOR_QUANTITIES}
+    fitted = sum(name.owner == "accelerometer" for name in names)
     poses = data.get("poses")
     turns = data.get("turns")
     counts = {}
     if poses is not None:
         # by hand a pose tells the norm alone; a known pose tells all three axes
-        by_pose = 1 if numbers["accelerometer"] <= 9 else 3
+        by_pose = 1 if fitted <= 9 else 3
         counts["accelerometer", "gain"] = counts["accelerometer", "bias"] = "accelerometer", by_pose * poses
         counts["gyroscope", "bias"] = "gyroscope", 3 * poses
         counts["gyroscope", "gain"] = "turns", None if turns is None else 2 * turns
     conditions = {}
     for (owner, part), (kind, count) in counts.items():
         if count is not None and kind in excess:
-            free = numbers[owner] if owner == "accelerometer" else 9 if part == "gain" else 3
+            free = fitted if owner == "accelerometer" else 9 if part == "gain" else 3
             conditions[owner, part] = np.array([max(1.0, count - free)]), share_of(np.array([excess[kind]]))
     gravity = calibration.gravity.sigma / calibration.gravity.value
     return Units(imu, flatten(imu)[None], names, calibration.covariance[None], np.array([gravity]), conditions)
@@ -223,7 +224,7 @@ def _freedom(units: Units, names: Sequence[str], sigma: FloatArray, gravity: Flo
     """Return the effective degrees of freedom (n, q)."""
     effective = np.full(sigma.shape, np.inf)
     for column, name in enumerate(names):
-        owner, _, part = name.partition("[")[0].partition(".")
+        _, owner, part, _ = parts_of(name)
         known = units.conditions.get((SENSORS.get(owner, owner), "bias" if part == "bias" else "gain"))
         if known is None:
             continue

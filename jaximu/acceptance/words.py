@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,15 +38,29 @@ _PARTS = {
 }
 
 
+class NameParts(NamedTuple):
+    """What the name of a quantity says: of `gyroscope.bias[2]` the stem, `gyroscope.bias`, its two words, the axes."""
+
+    stem: str
+    owner: str
+    part: str
+    axes: tuple[int, ...]
+
+
+def parts_of(name: str) -> NameParts:
+    """Take the name of a quantity apart; one of all axes has none."""
+    stem, _, axes = name.partition("[")
+    owner, _, part = stem.partition(".")
+    return NameParts(stem, owner, part, tuple(map(int, re.findall(r"\d+", axes))))
+
+
 def spoken(name: str) -> str:
     """Turn `accelerometer.misalignment[1,0]` into "accelerometer misalignment y from x"."""
-    stem, _, axes = name.rstrip("]").partition("[")
-    owner, _, part = stem.partition(".")
+    _, owner, part, axes = parts_of(name)
     if part not in _PARTS:
         return name
     directions = ("east", "north", "up") if owner == "navigation" else "xyz"
-    letters = [directions[int(axis)] for axis in axes.split(",") if axis]
-    return f"{owner} {_PARTS[part]} {' from '.join(letters)}".strip()
+    return f"{owner} {_PARTS[part]} {' from '.join(directions[axis] for axis in axes)}".strip()
 
 
 def in_shown_unit(unit: str, stated: str = "") -> tuple[str, float]:
@@ -78,5 +94,5 @@ def between(low: float, high: float, unit: str, stated: str = "") -> str:
 
 def si_unit(name: str) -> str:
     """Return the unit in tables of a bias, scale or misalignment by its name, such as `gyroscope.bias[0]`."""
-    owner, _, part = name.partition("[")[0].partition(".")
+    _, owner, part, _ = parts_of(name)
     return {"scale": "1", "misalignment": "rad"}.get(part) or SENSOR_UNITS[owner]

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaximu.acceptance.epochs import over_temperature
+from jaximu.acceptance.epochs import over_temperature, without_gravity
 from jaximu.calibration import Calibration
 from jaximu.estimation.projection import OutputUncertainty
 from jaximu.estimation.uncertainty import direction_words
@@ -64,7 +63,7 @@ def uncertainty_parts(calibration: Calibration) -> Iterator[Part]:
 
     Gravity's error is stated beside: it is alike in every orientation, and no pose makes it smaller.
     """
-    triads, recorded, extent = calibration.triads(), _recorded(calibration), Range.of(calibration)
+    triads, recorded, extent = calibration.triads(), without_gravity(calibration), Range.of(calibration)
     if "accelerometer" in triads:
         errors = evidence(calibration)
         poses, after = (np.zeros((0, 3)), []) if errors is None else (errors.directions, errors.norm_after)
@@ -95,18 +94,12 @@ def uncertainty_parts(calibration: Calibration) -> Iterator[Part]:
         )
 
 
-def _recorded(calibration: Calibration) -> Calibration:
-    """Return a calibration without the part of its covariance that is gravity's."""
-    shift = calibration.gravity_shift()
-    return replace(calibration, covariance=calibration.covariance - np.outer(shift, shift))
-
-
 def at_rest(calibration: Calibration) -> FloatArray:
     """Return `over_sphere` of a calibration, without gravity's own error."""
     rest = partial(
         steady, gravity=calibration.gravity.value, temperature=float(np.mean(Range.of(calibration).temperature))
     )
-    return over_sphere(_recorded(calibration).uncertainty_of, rest)
+    return over_sphere(without_gravity(calibration).uncertainty_of, rest)
 
 
 def over_sphere(known: Known, rest: Rest) -> FloatArray:
