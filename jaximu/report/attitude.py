@@ -12,6 +12,7 @@ from jaximu.calibration.attitude import fitted_mounting
 from jaximu.data.attitude import AgainstAttitude
 from jaximu.ground.page import Page, Picture, Statement
 from jaximu.ground.quantities import Z95, sentence, unit_text, with_interval
+from jaximu.ground.vectors import root_or_zero
 from jaximu.report.calibration import calibration_page
 from jaximu.report.canvas import Figure
 from jaximu.report.figures import AFTER, BEFORE, dressed, legend, stacked
@@ -51,7 +52,7 @@ def mounting_words(calibration: Calibration) -> Iterator[str]:
         )
     wide = alignment["filter"]["variance"]
     half = Z95 * alignment["filter"]["sigma"]
-    least, most = (1e3 * np.sqrt(max(abs(wide) + end, 0.0)) for end in (-half, half))
+    least, most = (1e3 * root_or_zero(abs(wide) + end) for end in (-half, half))
     if least:
         smoothed, beyond = ("reference", "") if wide > 0 else ("gyroscope", " beyond the reference")
         yield f"The {smoothed} is smoothed as by a first-order lag of {least:.3g} to {most:.3g} ms (95 %){beyond}."
@@ -97,7 +98,7 @@ def page_of(calibration: Calibration, measurement: AgainstAttitude) -> Page:
 def _figure(calibration: Calibration, measurement: AgainstAttitude) -> Figure:
     assert calibration.nominal is not None
     nominal = calibration.nominal.with_effects(*calibration.imu.setup)
-    figure, panels = stacked(2, 2.2, sharex=True)
+    figure, panels = stacked(2, 2.2, across="time [s]", sharex=True)
     before_after = [measurement.errors(imu) for imu in (nominal, calibration.imu)]
     for panel, (name, title) in zip(panels, _PANELS.items(), strict=True):
         for errors, colour, label in zip(before_after, (BEFORE, AFTER), ("before", "calibrated"), strict=True):
@@ -106,5 +107,4 @@ def _figure(calibration: Calibration, measurement: AgainstAttitude) -> Figure:
             panel.plot([], [], ".", color=colour, label=label)
         dressed(panel, title, 0.0, ylabel=f"error [{unit_text(unit)}]")
     legend(panels[0], 2, "upper right")
-    panels[-1].set_xlabel("time [s]")
     return figure

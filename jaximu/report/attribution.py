@@ -13,6 +13,7 @@ from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE
 from jaximu.report import figures
 from jaximu.report.canvas import Figure
+from jaximu.report.tables import p_text
 
 _DRAWN = 8
 """Sessions whose common drift is drawn at most."""
@@ -90,7 +91,7 @@ def _first(attribution: Attribution) -> Iterator[Part]:
                 _names("unit", finding.units, attribution.units),
                 _names("session", finding.sessions, attribution.sessions),
                 f"{100 * finding.share:.0f} %",
-                probability(finding.p_value).removeprefix("= "),
+                p_text(finding.p_value),
             )
             for finding in attribution.findings
         ],
@@ -157,7 +158,7 @@ def _short(diagnosis: dict) -> str:
 
 def _drift_figure(drifts: Sequence[CommonDrift], common: Sequence[CommonDrift]) -> Figure:
     factor, unit = readable("rad/s", max(drift.size for drift in drifts))
-    figure, grid = figures.stacked(len(drifts), 2.0, 1.0, sharex=True, sharey=True)
+    figure, grid = figures.stacked(len(drifts), 2.0, 1.0, across="time (s)", sharex=True, sharey=True)
     for axes, drift in zip(grid, drifts, strict=True):
         for line in drift.axes:
             axes.plot(drift.times, factor * line, color=figures.BEFORE, linewidth=0.6, alpha=0.5)
@@ -169,5 +170,4 @@ def _drift_figure(drifts: Sequence[CommonDrift], common: Sequence[CommonDrift]) 
         axes.set_ylabel(f"rate ({unit_text(unit)})", fontsize=8)
     spread = factor * max(float(np.abs(drift.curve).max()) for drift in drifts)
     grid[0].set_ylim(-2 * spread, 2 * spread)
-    grid[-1].set_xlabel("time (s)")
     return figure

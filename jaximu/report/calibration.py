@@ -63,7 +63,8 @@ def _stations_figure(calibration: Calibration) -> Figure:
     stations = calibration.stations
     assert fit is not None and stations is not None
     panels = [panel for panel in station_errors(fit.imu, stations, np.asarray(fit.excess)) if len(panel.station)]
-    figure, grid = figures.stacked(len(panels), 2.3, 0.0)
+    across = "pose or turn, in order of time (bars: 95 % of the noise)"
+    figure, grid = figures.stacked(len(panels), 2.3, 0.0, across=across)
     for axes, panel in zip(grid, panels, strict=True):
         for shift, (axis, color), error, sigma in zip(
             (-0.2, 0.0, 0.2), figures.AXES.items(), panel.error, panel.sigma, strict=True
@@ -71,7 +72,6 @@ def _stations_figure(calibration: Calibration) -> Figure:
             axes.errorbar(panel.station + shift, error, Z95 * sigma, fmt="o", ms=3.5, lw=0.8, color=color, label=axis)
         figures.dressed(axes, _error_words(panel.name), 0.0, ylabel=panel.unit)
     figures.legend(grid[0], 3, "upper right")
-    grid[-1].set_xlabel("pose or turn, in order of time (bars: 95 % of the noise)")
     return figure
 
 

@@ -28,6 +28,7 @@ from jaximu.recordings.finding import Finding
 from jaximu.report import figures
 from jaximu.report.canvas import Axes, Figure
 from jaximu.report.figures import band, dressed, legend
+from jaximu.report.tables import p_text
 from jaximu.report.words import compensation, file_names
 
 Twin = Callable[[], tuple[Experiment, State]]
@@ -263,7 +264,7 @@ def _lines_figure(diagnosis: Diagnosis) -> Figure:
     lines: dict[tuple[int, str, int], list[MovingLine]] = {}
     for one in diagnosis.lines:
         lines.setdefault((one.recording, one.triad, one.line.axis), []).append(one)
-    figure, grid = figures.stacked(min(len(lines), _PANELS), 2.4, 0.6)
+    figure, grid = figures.stacked(min(len(lines), _PANELS), 2.4, 0.6, across="time (s)")
     for axes, (key, mine) in zip(grid, lines.items(), strict=False):
         times, power = spectrum_at_rest(parts[key[0]], *key[1:])
         axes.pcolormesh(
@@ -286,7 +287,6 @@ def _lines_figure(diagnosis: Diagnosis) -> Figure:
         files = [source.path for source in parts[key[0]].recording.sources]
         title = f"{mine[0].axis} in {file_names(files)}" if len(parts) > 1 else mine[0].axis
         dressed(axes, title, ylabel="frequency (Hz)")
-    grid[-1].set_xlabel("time (s)")
     return figure
 
 
@@ -439,7 +439,7 @@ def _checks_table(checks: list[Check]) -> Table:
     return Table(
         ("check of the base model", "statistic", "p-value"),
         [
-            (*check.text.rpartition(": ")[::2], probability(check.adjusted).removeprefix("= "))
+            (*check.text.rpartition(": ")[::2], p_text(check.adjusted))
             for check in sorted(checks, key=lambda check: check.adjusted)
         ],
         "p-values allow for all checks together: below 0.01 the model or its noise is wrong there; above, chance does "

@@ -61,11 +61,16 @@ def new_figure(height: float, width: float = _WIDTH) -> Figure:
 
 
 def stacked(
-    count: int, height: float = 1.7, more: float = 0.8, width: float = _WIDTH, **shared: Any
+    count: int, height: float = 1.7, more: float = 0.8, width: float = _WIDTH, across: str = "", **shared: Any
 ) -> tuple[Figure, list[Any]]:
-    """Return a figure with so many panels below each other, each so many inches high, and `more` for what is beside."""
+    """Return a figure with so many panels below each other, each so many inches high, and `more` for what is beside.
+
+    `across`: words of the lowest panel's axis.
+    """
     figure = new_figure(more + height * count, width)
-    return figure, figure.subplots(count, 1, squeeze=False, **shared)[:, 0].tolist()
+    panels = figure.subplots(count, 1, squeeze=False, **shared)[:, 0].tolist()
+    panels[-1].set_xlabel(across)
+    return figure, panels
 
 
 def png(figure: Figure) -> bytes:
@@ -169,7 +174,7 @@ def _traces(axes: Axes, signal: Signal, offset: float = 0.0, named: bool = True)
 def signals_figure(recording: Recording) -> Figure:
     """Draw all signals of a recording against time, in SI units."""
     signals = recording.signals
-    figure, grid = stacked(len(signals), sharex=True)
+    figure, grid = stacked(len(signals), across="time (s)", sharex=True)
     for axes, (name, signal) in zip(grid, signals.items(), strict=True):
         _traces(axes, signal)
         unit = unit_text(SENSOR_UNITS.get(name, signal.unit))
@@ -177,7 +182,6 @@ def signals_figure(recording: Recording) -> Figure:
         axes.set_ylabel(f"{name.replace('_', ' ')}\n({unit})" if unit else name, fontsize=8)
         if signal.values.shape[1] == len(AXES):
             legend(axes, 3, "upper right")
-    grid[-1].set_xlabel("time (s)")
     return figure
 
 
@@ -363,7 +367,7 @@ def raised_to_sphere(x: FloatArray, y: FloatArray, sign: int) -> FloatArray:
 
 
 def hemispheres(
-    figure: Figure, columns: int, directions: FloatArray, names: Sequence[str], colors: Any = None, **dots: Any
+    figure: Figure, columns: int, directions: FloatArray, names: Sequence[str], colors: Any, **dots: Any
 ) -> tuple[list[tuple[Axes, int, BoolArray, FloatArray]], Any]:
     """Draw directions (n, 3), called by their names, on the two half spheres about ±z; `colors` (n,): values.
 
@@ -377,7 +381,7 @@ def hemispheres(
         axes = figure.add_subplot(grid[0, column])
         here = directions[:, 2] >= 0 if sign > 0 else directions[:, 2] < 0
         spot = _flat(directions[here])
-        drawn = axes.scatter(*spot.T, c=None if colors is None else colors[here], zorder=3, **dots)
+        drawn = axes.scatter(*spot.T, c=colors[here], zorder=3, **dots)
         named(drawn, [name for name, inside in zip(names, here, strict=True) if inside])
         axes.plot(np.cos(circle), np.sin(circle), color="black", linewidth=1)
         for px, py, text in ((1.14, 0, "+x"), (-1.14, 0, "−x"), (0, 1.12, "+y"), (0, -1.12, "−y")):

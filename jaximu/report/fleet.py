@@ -12,12 +12,12 @@ from jaximu.estimation.uncertainty import describe
 from jaximu.fleets.population import Difference, Fleet, Population
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.page import Items, Page, Part, Picture, Section, Table
-from jaximu.ground.quantities import counted, number, probability, sentence, with_interval
+from jaximu.ground.quantities import counted, number, sentence, with_interval
 from jaximu.mistakes.titles import effect_title
 from jaximu.report import figures
 from jaximu.report.canvas import Axes, Figure
 from jaximu.report.figures import dressed
-from jaximu.report.tables import MOST_ROWS
+from jaximu.report.tables import MOST_ROWS, p_text
 
 _UNIT, _STRANGER, _PRIOR = figures.AXES.values()
 _KINDS = (
@@ -131,7 +131,7 @@ def _outliers(fleet: Fleet, document: str) -> Section:
                             if abs(z) > 2
                         )
                         or "no single parameter, but their combination",
-                        probability(stranger.p_value).removeprefix("= "),
+                        p_text(stranger.p_value),
                         Path(stranger.file).name,
                     )
                     for stranger in fleet.strangers[:MOST_ROWS]
@@ -146,7 +146,7 @@ def _outliers(fleet: Fleet, document: str) -> Section:
 def _differences(fleet: Fleet) -> Iterator[Part]:
     names = {"lot": "lot", "date": "drift", "device": "recorded again", "effect": "effect shared by a lot"}
     rows = [
-        (names[difference.kind], difference_words(difference), probability(difference.p_value).removeprefix("= "))
+        (names[difference.kind], difference_words(difference), p_text(difference.p_value))
         for difference in fleet.differences
     ]
     if rows:
@@ -300,9 +300,10 @@ def _panels(population: Population, title: str) -> tuple[Figure, list[tuple[Axes
     return figure, [(figure.add_subplot(rows, 3, position), *panel) for position, panel in enumerate(there, 1)]
 
 
-def _beside(column: int, count: int) -> FloatArray:
-    """Return where the dots of a column stand, spread out so that they do not cover each other."""
-    return column + 0.3 * np.random.default_rng(column).uniform(-1, 1, count)
+def _dots(axes: Axes, column: int, values: FloatArray, color: str, opaque: float) -> None:
+    """Draw the units of a column, spread out so that they do not cover each other."""
+    beside = column + 0.3 * np.random.default_rng(column).uniform(-1, 1, len(values))
+    axes.plot(beside, values, ".", color=color, alpha=opaque, ms=5, mew=0)
 
 
 def _axis_names(axes: Axes, population: Population, columns: Sequence[int]) -> None:
@@ -320,7 +321,7 @@ def population_figure(fleet: Fleet) -> Figure:
     for axes, kind, columns in panels:
         for column, k in enumerate(columns):
             values = kind[-1] * (fleet.values[:, k] - population.mean[k])
-            axes.plot(_beside(column, len(values)), values, ".", color=_UNIT, alpha=opaque, ms=5, mew=0)
+            _dots(axes, column, values, _UNIT, opaque)
             two = 2 * kind[-1] * population.spread[k]
             axes.plot([column, column], [-two, two], color="black", linewidth=2.2, solid_capstyle="butt")
             axes.plot([column - 0.12, column + 0.12], [0, 0], color="black", linewidth=2.2)
@@ -356,7 +357,7 @@ def prior_figure(fleet: Fleet) -> Figure:
     share = 100 * fleet.shrunk_sigma / fleet.sigma
     for axes, kind, columns in panels:
         for column, k in enumerate(columns):
-            axes.plot(_beside(column, len(share)), share[:, k], ".", color=_PRIOR, alpha=0.5, ms=5, mew=0)
+            _dots(axes, column, share[:, k], _PRIOR, 0.5)
         _axis_names(axes, population, columns)
         dressed(axes, kind[3], 100.0, ylabel="with prior / alone [%]", ylim=(0, 108))
     return figure
@@ -378,15 +379,7 @@ def lot_figure(fleet: Fleet, difference: Difference) -> Figure:
     figure, (axes,) = figures.beside(1, 3.2)
     for column, lot in enumerate(names):
         points = values[lots == lot]
-        axes.plot(
-            _beside(column, len(points)),
-            points,
-            ".",
-            color=_STRANGER if lot in different else _UNIT,
-            alpha=0.5,
-            ms=5,
-            mew=0,
-        )
+        _dots(axes, column, points, _STRANGER if lot in different else _UNIT, 0.5)
         axes.plot([column - 0.3, column + 0.3], [np.median(points)] * 2, color="black", linewidth=2)
     dressed(axes, ylabel=f"off the mean [{kind[4]}]")
     axes.set_xticks(range(len(names)), names, rotation=0 if len(names) < 15 else 90, fontsize=8)

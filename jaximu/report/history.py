@@ -13,8 +13,10 @@ from jaximu.acceptance.words import in_shown_unit, spoken
 from jaximu.ground.distributions import student_isf
 from jaximu.ground.page import Page, Part, Picture, Statement, Table
 from jaximu.ground.quantities import Z95, counted, number, probability, sentence, size, with_interval
+from jaximu.ground.vectors import root_or_zero
 from jaximu.report import figures
 from jaximu.report.canvas import Axes, Figure
+from jaximu.report.tables import p_text
 
 _DRAWN = 4
 """Numbers that are drawn over time and temperature: those whose change is surest."""
@@ -181,9 +183,9 @@ def _numbers_table(history: UnitHistory) -> Table:
             _amount(movement, movement.values[0], movement.sigmas[0], False),
             _amount(movement, movement.difference, movement.sigma),
             f"{abs(movement.z):.1f}",
-            probability(movement.adjusted).removeprefix("= ") if movement.tested else "differs after every power-on",
+            p_text(movement.adjusted) if movement.tested else "differs after every power-on",
             *[_drift(movement)] * over_time,
-            *[probability(movement.line.p_value).removeprefix("= ")] * straight,
+            *[p_text(movement.line.p_value)] * straight,
         ]
         for movement in movements
     ]
@@ -203,7 +205,7 @@ def _together_table(history: UnitHistory) -> Table:
             "all, without gyroscope bias" if name == "all" else name,
             number(test.statistic),
             str(test.freedom),
-            probability(test.p_value).removeprefix("= "),
+            p_text(test.p_value),
         )
         for name, test in history.together.items()
     ]
@@ -266,8 +268,7 @@ def _changes_figure(history: UnitHistory) -> Figure:
 def _drawn(history: UnitHistory, at: NDArray[Any], across: str) -> tuple[Figure, list[tuple[Axes, Movement, float]]]:
     """Draw the numbers whose change is surest, with their intervals; return panels, numbers, and factors to units."""
     surest = sorted(history.movements, key=lambda movement: (not movement.tested, movement.p_value))[:_DRAWN]
-    figure, panels = figures.stacked(len(surest), sharex=True)
-    panels[-1].set_xlabel(across)
+    figure, panels = figures.stacked(len(surest), across=across, sharex=True)
     drawn = []
     for panel, movement in zip(panels, surest, strict=True):
         shown, factor = in_shown_unit(movement.unit)
@@ -294,7 +295,7 @@ def _history_figure(history: UnitHistory) -> Figure:
         ahead = np.linspace(history.times[0], 0.0, 100)
         shared = movement.sigmas[-1] ** 2 - movement.apart[-1] ** 2
         variance = line.covariance[0, 0] - shared + (2 * line.covariance[0, 1] + line.covariance[1, 1] * ahead) * ahead
-        half = float(student_isf(0.025, line.freedom)) * np.sqrt(np.maximum(variance, 0.0))
+        half = float(student_isf(0.025, line.freedom)) * root_or_zero(variance)
         level = line.level + line.slope * ahead
         days = (history.times[-1] - ahead) / np.ptp(history.times) * (at[-1] - at[0])
         figures.band(panel, at[-1] - days, factor * level, factor * half, figures.AFTER)

@@ -10,7 +10,7 @@ import numpy as np
 from jaximu.acceptance.decision import FAIL, PASS
 from jaximu.acceptance.limits import Limit
 from jaximu.acceptance.line import FollowedQuantity, Line
-from jaximu.acceptance.statistics import Chart
+from jaximu.acceptance.statistics import Capability, Chart
 from jaximu.acceptance.words import amount, in_shown_unit, si_unit, spoken
 from jaximu.ground.page import Page, Picture, Section, Table
 from jaximu.ground.quantities import Z95, counted, number, sentence, with_interval
@@ -33,7 +33,7 @@ _TITLES = {
 }
 _ORDER = ("golden", "station", "lot", "average", "value", "jump")
 _VALUE, _OUT, _AVERAGE = figures.AXES.values()
-_WithCpk = Sequence[tuple[FollowedQuantity, float]]
+_Able = Sequence[tuple[FollowedQuantity, Capability]]
 
 
 def page_of(line: Line) -> Page:
@@ -62,31 +62,30 @@ def page_of(line: Line) -> Page:
         lambda: [_not_passed(line), _worst_lots(able), _gauge(line)],
         line.notes,
         _next(line),
-        caution=bool(line.counts[FAIL] or (able and able[0][1] < _CAPABLE)),
+        caution=bool(line.counts[FAIL] or (able and able[0][1].cpk[0] < _CAPABLE)),
     )
 
 
 # --- the first lines --------------------------------------------------------------------------------------------------
 
 
-def _by_capability(line: Line) -> _WithCpk:
-    able = [(quantity, quantity.capability.cpk[0]) for quantity in line.followed if quantity.capability is not None]
-    return sorted(able, key=lambda pair: pair[1])
+def _by_capability(line: Line) -> _Able:
+    able = [(quantity, quantity.capability) for quantity in line.followed if quantity.capability is not None]
+    return sorted(able, key=lambda pair: pair[1].cpk[0])
 
 
-def _number(line: Line, able: _WithCpk) -> tuple[str, str]:
-    if able and (capability := able[0][0].capability) is not None:
-        return _index(
-            capability.cpk
-        ), f"Cpk of {spoken(able[0][0].name)}, the worst quantity (95 %); a capable line has {_CAPABLE} or more"
+def _number(line: Line, able: _Able) -> tuple[str, str]:
+    for quantity, capability in able:
+        meaning = f"Cpk of {spoken(quantity.name)}, the worst quantity (95 %); a capable line has {_CAPABLE} or more"
+        return _index(capability.cpk), meaning
     if line.limits is not None:
         return f"{100 * line.counts[PASS] / line.table.total:.3g} %", "of the recordings pass"
     return "", ""
 
 
-def _verdict(line: Line, able: _WithCpk) -> Iterator[str]:
-    if able and able[0][1] < _CAPABLE:
-        yield _why_not_capable(able[0][0])
+def _verdict(line: Line, able: _Able) -> Iterator[str]:
+    if able and able[0][1].cpk[0] < _CAPABLE:
+        yield _why_not_capable(*able[0])
     elif able:
         yield f"Every quantity is capable: Cpk is {_CAPABLE} or more."
     if line.limits is not None:
@@ -104,12 +103,13 @@ def _verdict(line: Line, able: _WithCpk) -> Iterator[str]:
         yield "Too few units for control charts."
 
 
-def _why_not_capable(quantity: FollowedQuantity) -> str:
-    capability, limit, unit = quantity.capability, quantity.limit, si_unit(quantity.name)
-    assert capability is not None and limit is not None
+def _why_not_capable(quantity: FollowedQuantity, capability: Capability) -> str:
+    limit = quantity.limit
+    assert limit is not None
     why = f"varies too much for the limits {limit.words()}"
     if not capability.cp[0] < _CAPABLE:  # or there is one limit only
-        why = f"has a mean, {amount(capability.mean, unit, 3, limit.stated)}, too near a limit ({limit.words()})"
+        mean = amount(capability.mean, si_unit(quantity.name), 3, limit.stated)
+        why = f"has a mean, {mean}, too near a limit ({limit.words()})"
     verb = "is not" if capability.cpk[2] < _CAPABLE else "may not be"  # by the interval's upper end
     return f"The line {verb} capable: {spoken(quantity.name)} {why}."
 
@@ -128,7 +128,7 @@ def _next(line: Line) -> str:
 # --- tables -----------------------------------------------------------------------------------------------------------
 
 
-def _capability(line: Line, able: _WithCpk) -> Section:
+def _capability(line: Line, able: _Able) -> Section:
     judged = line.judged
     failed = {} if judged is None else dict(zip(judged.names, np.sum(judged.verdict == FAIL, axis=0), strict=True))
     return Section(
@@ -136,21 +136,20 @@ def _capability(line: Line, able: _WithCpk) -> Section:
         [
             Table(
                 ("quantity", "Cpk (95 %)", "Cp (95 %)", "mean ± standard deviation", "limits", "fail"),
-                [_capability_row(quantity, failed.get(quantity.name, 0)) for quantity, _ in able],
+                [_capability_row(*pair, failed.get(pair[0].name, 0)) for pair in able],
                 "Of each device's first recording; the deviation is that of all units, drift between them included. "
                 f"Marked: Cpk below {_CAPABLE}. Fail: recordings of all.",
-                [row for row, (_, cpk) in enumerate(able) if cpk < _CAPABLE],
+                [row for row, (_, capability) in enumerate(able) if capability.cpk[0] < _CAPABLE],
                 brief=6,
             )
         ],
     )
 
 
-def _capability_row(quantity: FollowedQuantity, failed: int) -> tuple[str, ...]:
-    capability, limit, unit = quantity.capability, quantity.limit, si_unit(quantity.name)
-    assert capability is not None and limit is not None
-
-    shown, factor = in_shown_unit(unit, limit.stated)
+def _capability_row(quantity: FollowedQuantity, capability: Capability, failed: int) -> tuple[str, ...]:
+    limit = quantity.limit
+    assert limit is not None
+    shown, factor = in_shown_unit(si_unit(quantity.name), limit.stated)
     return (
         spoken(quantity.name),
         _index(capability.cpk),
@@ -161,7 +160,7 @@ def _capability_row(quantity: FollowedQuantity, failed: int) -> tuple[str, ...]:
     )
 
 
-def _worst_lots(able: _WithCpk) -> Section:
+def _worst_lots(able: _Able) -> Section:
     rows = []
     for quantity, _ in able:
         if quantity.lots:
@@ -245,7 +244,7 @@ def _gauge(line: Line) -> Section:
 def _to_draw(line: Line) -> list[tuple[FollowedQuantity, str]]:
     """Return the charts that show most: of the least capable quantity, those with alarms, those of a low Cpk."""
     charts = [(quantity, station) for quantity in line.followed for station in quantity.charts]
-    cpk = {quantity.name: value for quantity, value in _by_capability(line)}
+    cpk = {quantity.name: capability.cpk[0] for quantity, capability in _by_capability(line)}
     worst = next(iter(cpk), "")
 
     def rank(entry: tuple[FollowedQuantity, str]) -> tuple[bool, int, float]:

@@ -14,6 +14,7 @@ from jaximu.estimation.uncertainty import signed_axes
 from jaximu.ground.document import Json
 from jaximu.ground.page import Page, Picture, Statement
 from jaximu.ground.quantities import Z95, number, sentence
+from jaximu.ground.vectors import lengths_of
 from jaximu.report.calibration import calibration_page
 from jaximu.report.canvas import Figure
 from jaximu.report.figures import dressed, hemispheres, new_figure
@@ -144,7 +145,7 @@ def page_of(
 def _figure(calibration: Calibration, measurement: MagneticField, heading: Heading | None) -> Figure:
     windows = measurement.windows
     field = windows.field(calibration.imu)[windows.used]
-    length = np.linalg.norm(field, axis=1)
+    length = lengths_of(field)
     off = 100 * (length / measurement.strength - 1)
     figure = new_figure(3.6)
     limit = np.quantile(np.abs(off), 0.98)

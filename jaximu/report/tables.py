@@ -13,8 +13,9 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe, label
 from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.page import Matrices, Part
-from jaximu.ground.quantities import Z95, number, plain, raised, unit_text, with_interval
+from jaximu.ground.quantities import Z95, number, plain, probability, raised, unit_text, with_interval
 from jaximu.ground.units import STANDARD_GRAVITY
+from jaximu.ground.vectors import root_or_zero
 from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu, Triad
 
@@ -40,6 +41,11 @@ MOST_ROWS = 50
 _MILLI_G = 1e-3 * STANDARD_GRAVITY
 
 
+def p_text(p_value: float) -> str:
+    """Return a p-value as a cell of a table has it."""
+    return probability(p_value).removeprefix("= ")
+
+
 def short_name(name: Name, model: Imu | None = None) -> str:
     """Turn `accelerometer.gain[1,0]` into a.m_yx: scale s_x, misalignment m_yx (input x seen by output y), bias b_x.
 
@@ -53,21 +59,17 @@ def short_name(name: Name, model: Imu | None = None) -> str:
 
 def snippet(calibration: Calibration) -> str:
     """Return lines of Python that apply a calibration, numbers in full precision; "" where triads have effects."""
-
-    def listed(values: FloatArray) -> str:
-        return "[" + ", ".join(repr(float(value)) for value in values) + "]"
-
     lines = ["import numpy as np"]
     for name, triad in calibration.triads().items():
         if triad.effects:
             return ""
         short = name[0]
         known = _INPUTS[name]
-        gain = (",\n" + 16 * " ").join(listed(row) for row in np.asarray(triad.gain))
+        gain = (",\n" + 16 * " ").join(map(str, np.asarray(triad.gain).tolist()))
         unit = "".join(letter for letter in triad.output_unit if letter.isprintable())
         lines += [
             f"K_{short} = np.array([{gain}])",
-            f"b_{short} = np.array({listed(np.asarray(triad.bias))})",
+            f"b_{short} = np.array({np.asarray(triad.bias).tolist()})",
             f"{known.letter} = ({known.output} - b_{short}) @ np.linalg.inv(K_{short}).T"
             f"  # {known.code}, from {known.output}: (n, 3) in {unit}",
         ]
@@ -186,7 +188,7 @@ def _ratio_sigma(calibration: Calibration, name: str, gain: FloatArray, i: int, 
     for column, value in ((j, 1 / gain[i, i]), (i, -gain[i, j] / gain[i, i] ** 2)):
         if (entry := Name(name, "gain", (i, column))) in calibration.names:
             slope[calibration.names.index(entry)] = value
-    return float(np.sqrt(max(slope @ calibration.covariance @ slope, 0.0)))
+    return float(root_or_zero(slope @ calibration.covariance @ slope))
 
 
 def equations(calibration: Calibration) -> Iterator[tuple[str, list[Part]]]:

@@ -13,10 +13,11 @@ from jaximu.diagnosis.validity import Shift
 from jaximu.estimation.rows import TIME
 from jaximu.ground.page import Page, Part, Picture, Statement, Table
 from jaximu.ground.quantities import change, listed, number, probability, sentence, with_interval
+from jaximu.ground.vectors import lengths_of
 from jaximu.mistakes.titles import effect_title
 from jaximu.report import figures
 from jaximu.report.canvas import Figure
-from jaximu.report.tables import short_name
+from jaximu.report.tables import p_text, short_name
 
 _OUTPUTS = {
     "accelerometer": "accelerometer's output",
@@ -86,7 +87,7 @@ def _shift_row(shift: Shift) -> tuple[str, ...]:
         return *known, "not determined here", "", "", ""
     if not shift.tested:
         return *known, shift.amount, shift.output, "", "differs after every power-on"
-    return *known, shift.amount, shift.output, f"{abs(shift.z):.1f}", probability(shift.p_value).removeprefix("= ")
+    return *known, shift.amount, shift.output, f"{abs(shift.z):.1f}", p_text(shift.p_value)
 
 
 def _statements(validity: Validity) -> Iterator[Statement]:
@@ -171,7 +172,7 @@ def _errors(validity: Validity, experiment: Experiment) -> Figure:
     fresh = "fresh calibration" + f" with {extended}" * bool(extended)
     labels = ("old calibration", figures.FLAGGED), (fresh, figures.AFTER)
     for (label, colour), conditions in zip(labels, validity.conditions, strict=True):
-        angles = np.degrees(np.linalg.norm(conditions[turns].reshape(-1, 2), axis=1))
+        angles = np.degrees(lengths_of(conditions[turns].reshape(-1, 2)))
         for panel, time, values in zip(panels, times, (1e3 * conditions[norms], angles), strict=True):
             panel.plot(time, values, "o", color=colour, markersize=4, label=label)
     titles = ("gravity norm at rest", "gravity carried over a turn")

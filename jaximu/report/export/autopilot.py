@@ -11,7 +11,7 @@ import scipy
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.recordings.readers.parameters import ParameterFile
-from jaximu.report.export.base import Correction, ExportedUnit, LinearTriad, Logged, matrix_text, vector_text
+from jaximu.report.export.base import Correction, ExportedUnit, LinearTriad, Logged, exact_text
 
 _ROTATIONS = (
     "0 0 0,0 0 45,0 0 90,0 0 135,0 0 180,0 0 225,0 0 270,0 0 315,180 0 0,180 0 45,180 0 90,180 0 135,0 180 0,180 0 225,"
@@ -110,8 +110,8 @@ class Firmware(ABC):
                 written = dict(zip(self.matrix, parts, strict=True))
                 word = self.matrix[0]
                 sign = "+" if self.rotated else "-"
-                equation += [f"h [{self.unit[0]}] = S (y {sign} {word}), S = {matrix_text(matrix)}"]
-                equation += [f"{word} = {vector_text(shift)}"]
+                equation += [f"h [{self.unit[0]}] = S (y {sign} {word}), S = {exact_text(matrix)}"]
+                equation += [f"{word} = {exact_text(shift)}"]
                 if not np.array_equal(axes, np.eye(3)):
                     along = ["+-"[int(sum(column) < 0)] + "xyz"[int(np.flatnonzero(column)[0])] for column in axes.T]
                     words = (
@@ -128,7 +128,7 @@ class Firmware(ABC):
                 equation += [f"w = y - {self.offset}"]
             corrections[name] = logged.correction(corrections[name])
             if name != "magnetometer":
-                equation += [f"{word} = {vector_text(part)}" for word, part in written.items()]
+                equation += [f"{word} = {exact_text(part)}" for word, part in written.items()]
             values |= {
                 self.parameter(self.patterns[name], name, number, word=word, axis=axis): float(value)
                 for word, part in written.items()

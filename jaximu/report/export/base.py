@@ -200,6 +200,11 @@ class ExportedUnit:
         made["accel_matrix"], made["gyro_matrix"] = np.tril(made["accel_matrix"]), np.tril(made["gyro_matrix"])
         return made
 
+    @property
+    def rate(self) -> float | None:
+        """The samples' rate, Hz: that of the noise, or else of the calibration's recording, where one is known."""
+        return self.noise.get("update_rate", self.calibration.data.get("rate"))
+
     def require_own_axes(self) -> None:
         """Raise `NotPossibleError` where answers are along other axes than outputs, for tools with a scale an axis."""
         self._require("a scale on each axis", lambda turn: bool(np.diagonal(turn).all()))
@@ -237,8 +242,8 @@ class ExportedUnit:
             extra = " - G f" if np.any(correction.g_sensitivity) else ""
             lines.append(
                 f"{name}: {u} [{SENSOR_UNITS[name]}] = {symbol} (y - b{extra}), y in {self.triads[name].unit}\n"
-                f"{symbol} = {matrix_text(correction.matrix)}\nb = {vector_text(correction.offset)}"
-                + (f"\nG = {matrix_text(correction.g_sensitivity)}" if extra else "")
+                f"{symbol} = {exact_text(correction.matrix)}\nb = {exact_text(correction.offset)}"
+                + (f"\nG = {exact_text(correction.g_sensitivity)}" if extra else "")
             )
         return "\n".join(lines)
 
@@ -248,14 +253,9 @@ def text_file(lines: Iterable[str]) -> dict[str, bytes]:
     return {"": ("\n".join(lines) + "\n").encode()}
 
 
-def vector_text(values: FloatArray) -> str:
-    """A vector as text that reads back exactly: "[1.0, 2.0, 3.0]", which YAML, JSON and Python share."""
-    return "[" + ", ".join(repr(float(value) + 0.0) for value in values) + "]"
-
-
-def matrix_text(values: FloatArray) -> str:
-    """A matrix in the same notation, on one line."""
-    return "[" + ", ".join(vector_text(row) for row in values) + "]"
+def exact_text(values: FloatArray) -> str:
+    """A vector or a matrix as text that reads back exactly: "[1.0, 2.0, 3.0]", which YAML, JSON and Python share."""
+    return str((np.asarray(values, float) + 0.0).tolist())
 
 
 def yaml_matrices(named: Mapping[str, FloatArray], indent: int, rows: int) -> list[str]:
@@ -263,7 +263,7 @@ def yaml_matrices(named: Mapping[str, FloatArray], indent: int, rows: int) -> li
     return [
         line
         for name, matrix in named.items()
-        for line in (f"{' ' * indent}{name}:", *(f"{' ' * rows}- {vector_text(row)}" for row in matrix))
+        for line in (f"{' ' * indent}{name}:", *(f"{' ' * rows}- {exact_text(row)}" for row in matrix))
     ]
 
 

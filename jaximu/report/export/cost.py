@@ -14,6 +14,7 @@ from jaximu.ground.distributions import rms
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import size
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSOR_UNITS
+from jaximu.ground.vectors import lengths_of
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.report.export.base import ExportedUnit, Written
@@ -199,7 +200,7 @@ def _gap(
 
 def _loss(what: str, errors: dict[str, FloatArray]) -> Loss:
     """The greatest and rms length of errors (..., 3); None where one of them is not finite."""
-    lengths = {name: np.linalg.norm(error, axis=-1) for name, error in errors.items()}
+    lengths = {name: lengths_of(error) for name, error in errors.items()}
     known = {name: bool(np.isfinite(length).all()) for name, length in lengths.items()}
     return Loss(
         what,

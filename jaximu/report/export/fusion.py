@@ -13,7 +13,7 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.units import STANDARD_GRAVITY
-from jaximu.report.export.base import Correction, ExportedUnit, Written, comments, matrix_text, text_file, vector_text
+from jaximu.report.export.base import Correction, ExportedUnit, Written, comments, exact_text, text_file
 
 SUFFIX = ".h"
 SUMMARY = "x-io Fusion: misalignment, sensitivity, offset; soft and hard iron"
@@ -42,14 +42,14 @@ def write(parameters: ExportedUnit) -> Written:
                 "",
             ]
             equation.append(
-                f"{name}: u [{unit}] = M s (y - b), y in {triad.unit}\nM = {matrix_text(misalignment)}\n"
-                f"s = diag {vector_text(sensitivity)}\nb = {vector_text(offset)}"
+                f"{name}: u [{unit}] = M s (y - b), y in {triad.unit}\nM = {exact_text(misalignment)}\n"
+                f"s = diag {exact_text(sensitivity)}\nb = {exact_text(offset)}"
             )
             made[name] = Correction(misalignment * sensitivity / factor, offset)
         else:
             lines += [_matrix("softIronMatrix", inverse), _vector("hardIronOffset", offset), ""]
             equation.append(
-                f"{name}: h [uT] = S (y - b), y in {triad.unit}\nS = {matrix_text(inverse)}\nb = {vector_text(offset)}"
+                f"{name}: h [uT] = S (y - b), y in {triad.unit}\nS = {exact_text(inverse)}\nb = {exact_text(offset)}"
             )
             made[name] = Correction(inverse, offset)
     return Written(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.model.conventions import ImuTk
-from jaximu.report.export.base import ExportedUnit, Written, matrix_text, vector_text
+from jaximu.report.export.base import ExportedUnit, Written, exact_text
 
 SUFFIX = ".calib"
 SUMMARY = "imu_tk: one .calib a triad (…_acc, …_gyro)"
@@ -30,8 +30,8 @@ def write(parameters: ExportedUnit) -> Written:
         text = "\n\n".join("\n".join(" ".join(repr(float(cell)) for cell in row) for row in part) for part in parts)
         files[ending] = (text + "\n\n").encode()
         equation.append(
-            f"{name}: u = T K (y - b)\nT = {matrix_text(misalignment)}\nK = diag {vector_text(scale)}"
-            f"\nb = {vector_text(bias)}"
+            f"{name}: u = T K (y - b)\nT = {exact_text(misalignment)}\nK = diag {exact_text(scale)}"
+            f"\nb = {exact_text(bias)}"
         )
     return Written(
         files,

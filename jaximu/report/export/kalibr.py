@@ -15,9 +15,8 @@ from jaximu.report.export.base import (
     ExportedUnit,
     Written,
     comments,
-    matrix_text,
+    exact_text,
     text_file,
-    vector_text,
     yaml_matrices,
 )
 
@@ -29,7 +28,7 @@ SUMMARY = "Kalibr: imu.yaml with M, C_gyro_i, A"
 def write(parameters: ExportedUnit) -> Written:
     """Write both triads in kalibr's frame, noise densities as far as they are known."""
     view = parameters.kalibr()
-    frame, accel, accel_bias = view["body_rotation"], view["accel_matrix"], vector_text(view["accel_bias"])
+    frame, accel, accel_bias = view["body_rotation"], view["accel_matrix"], exact_text(view["accel_bias"])
     lines = [
         comments(parameters),
         "# y = M f + bias (accelerometer), y = M C_gyro_i w + A C_gyro_i f + bias (gyroscope).",
@@ -43,18 +42,18 @@ def write(parameters: ExportedUnit) -> Written:
     corrections = {
         "accelerometer": Correction(np.asarray(np.linalg.inv(accel), float), view["accel_bias"], frame=frame)
     }
-    equation = f"f = inverse(M) (y - b)\nM = {matrix_text(accel)}\nb = {accel_bias}"
+    equation = f"f = inverse(M) (y - b)\nM = {exact_text(accel)}\nb = {accel_bias}"
     if "gyroscope" in parameters.triads:
         gyro, rotation, sensitivity = view["gyro_matrix"], view["gyro_rotation"], view["g_sensitivity"]
         blocks = {"M": gyro, "A": sensitivity, "C_gyro_i": rotation}
-        bias = vector_text(view["gyro_bias"])
+        bias = exact_text(view["gyro_bias"])
         lines += ["  gyroscopes:", *yaml_matrices(blocks, 4, 4), f"    bias: {bias}"]
         corrections["gyroscope"] = Correction(
             rotation.T @ np.linalg.inv(gyro), view["gyro_bias"], sensitivity @ rotation, frame
         )
         equation += (
-            f"\nw = transpose(C_gyro_i) inverse(M) (y - b - A C_gyro_i f)\nM = {matrix_text(gyro)}"
-            f"\nC_gyro_i = {matrix_text(rotation)}\nA = {matrix_text(sensitivity)}\nb = {bias}"
+            f"\nw = transpose(C_gyro_i) inverse(M) (y - b - A C_gyro_i f)\nM = {exact_text(gyro)}"
+            f"\nC_gyro_i = {exact_text(rotation)}\nA = {exact_text(sensitivity)}\nb = {bias}"
         )
     lines += noise_lines(parameters, "  ")
     lines += ["  model: scale-misalignment", "  rostopic: /imu0", "  time_offset: 0.0"]
@@ -62,7 +61,7 @@ def write(parameters: ExportedUnit) -> Written:
     convention = (
         "forward: y = M u + b, M lower-triangular, in output units per SI unit; A is applied to the rotated specific "
         "force. rostopic is a placeholder: set yours."
-        + (f" Kalibr's frame is not the calibration's: u_kalibr = Q u, Q = {matrix_text(frame)}." if turned else "")
+        + (f" Kalibr's frame is not the calibration's: u_kalibr = Q u, Q = {exact_text(frame)}." if turned else "")
         + ("" if parameters.noise else " Kalibr needs noise densities: give --noise IMU.YAML from jaximu allan.")
     )
     return Written(text_file(lines), convention, equation, corrections, frozenset({"gyro.g_sensitivity"}))
@@ -70,8 +69,7 @@ def write(parameters: ExportedUnit) -> Written:
 
 def noise_lines(parameters: ExportedUnit, indent: str) -> list[str]:
     """The four densities and the rate as YAML; a number that is not known is a comment, never made up."""
-    rate = parameters.noise.get("update_rate", parameters.calibration.data.get("rate"))
-    known = parameters.noise
+    rate, known = parameters.rate, parameters.noise
     lines = [
         f"{indent}{key}: {known[key]:.9e}" if key in known else f"{indent}# {key}: not known [{unit}]"
         for key, unit in KALIBR_UNITS.items()

@@ -26,6 +26,7 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import FilePath, InputError
+from jaximu.ground.vectors import lengths_of
 from jaximu.recordings.recording import Recording, Signal
 
 _NOT_HELD = -1.0
@@ -132,7 +133,7 @@ def _imu(topic: str, signals: dict[str, Signal]) -> _Stream:
 def _residual(calibration: Calibration, corrected: Recording) -> Iterator[_Stream]:
     signal = corrected.signals.get("accelerometer")
     if signal is not None and signal.unit == "m/s^2":
-        off = np.linalg.norm(signal.values, axis=1) - calibration.gravity.value
+        off = lengths_of(signal.values) - calibration.gravity.value
         yield _Stream("/imu/residual", "std_msgs/msg/Float64", signal.time, off[:, None])
 
 

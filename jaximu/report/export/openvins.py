@@ -15,9 +15,8 @@ from jaximu.report.export.base import (
     ExportedUnit,
     Written,
     comments,
-    matrix_text,
+    exact_text,
     text_file,
-    vector_text,
     yaml_matrices,
 )
 from jaximu.report.export.kalibr import noise_lines
@@ -43,8 +42,8 @@ def write(parameters: ExportedUnit) -> Written:
         "Tg": sensitivity,
     }
     # no key of the file holds a bias: the filter starts from these, if its launch file is told, or finds them itself
-    accel_bias = vector_text(view["accel_bias"])
-    gyro_bias = vector_text(view["gyro_bias"])
+    accel_bias = exact_text(view["accel_bias"])
+    gyro_bias = exact_text(view["gyro_bias"])
     biases = [f"  # accelerometer bias {accel_bias} m/s^2: OpenVINS estimates it, see init_dyn_bias_a"]
     corrections = {"accelerometer": Correction(np.linalg.inv(blocks["Ta"]), zero, frame=frame)}
     if "gyroscope" in parameters.triads:
@@ -55,7 +54,7 @@ def write(parameters: ExportedUnit) -> Written:
     lines += [*yaml_matrices(blocks, 2, 4), *biases]
     equation = (
         "f = transpose(R_IMUtoACC) inverse(Ta) (y_a - b_a); w = transpose(R_IMUtoGYRO) inverse(Tw) (y_g - b_g - Tg f)\n"
-        + "\n".join(f"{key} = {matrix_text(matrix)}" for key, matrix in blocks.items())
+        + "\n".join(f"{key} = {exact_text(matrix)}" for key, matrix in blocks.items())
         + f"\nb_a = {accel_bias}\nb_g = {gyro_bias}"
     )
     convention = (

@@ -11,7 +11,7 @@ import json
 
 import numpy as np
 
-from jaximu.report.export.base import ExportedUnit, Written, matrix_text, vector_text
+from jaximu.report.export.base import ExportedUnit, Written, exact_text
 
 SUFFIX = ".json"
 SUMMARY = "RealSense: motion intrinsics (calibration.json of rs-imu-calibration)"
@@ -26,7 +26,7 @@ def write(parameters: ExportedUnit) -> Written:
         triad = parameters.triads.get(name)
         matrix, bias = (np.eye(3), np.zeros(3)) if triad is None else (triad.inverse, triad.inverse @ triad.bias)
         entry[name] = {"scale_and_alignment": matrix.T.ravel().tolist(), "bias": bias.tolist()}
-        equation.append(f"{name}: u = M y - b\nM = {matrix_text(matrix)}\nb = {vector_text(bias)}")
+        equation.append(f"{name}: u = M y - b\nM = {exact_text(matrix)}\nb = {exact_text(bias)}")
     text = json.dumps({"device_type": "D435i", "imus": [entry]}, indent=4, sort_keys=True)
     return Written(
         {"": (text + "\n").encode()},

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.ground.units import SENSOR_UNITS
-from jaximu.report.export.base import ExportedUnit, Written, comments, text_file, vector_text
+from jaximu.report.export.base import ExportedUnit, Written, comments, exact_text, text_file
 
 SUFFIX = ".yaml"
 MAGNETIC = True
@@ -30,11 +30,11 @@ def write(parameters: ExportedUnit) -> Written:
             f'        output_unit: "{parameters.triads[name].unit}"',
             f'        corrected_unit: "{SENSOR_UNITS[name]}"',
             f"        reference_temperature: {float(reference)!r}",
-            f"        matrix: {vector_text(correction.matrix.ravel())}",
-            f"        bias: {vector_text(correction.offset)}",
+            f"        matrix: {exact_text(correction.matrix.ravel())}",
+            f"        bias: {exact_text(correction.offset)}",
         ]
         if np.any(correction.g_sensitivity):
-            lines.append(f"        g_sensitivity: {vector_text(correction.g_sensitivity.ravel())}")
+            lines.append(f"        g_sensitivity: {exact_text(correction.g_sensitivity.ravel())}")
     convention = "inverse: u = matrix (y - bias - g_sensitivity f), bias in output units and subtracted first."
     equation = parameters.equation("matrix", sensitive=True)
     return Written(text_file(lines), convention, equation, corrections, frozenset({"gyro.g_sensitivity"}))

@@ -21,7 +21,7 @@ SUMMARY = "VINS-Mono, VINS-Fusion: noise per sample (no intrinsics)"
 def write(parameters: ExportedUnit) -> Written:
     """Write the noise at the recording's rate. Raises `NotPossibleError` without noise densities or a rate."""
     parameters.require_si("VINS")
-    rate = parameters.noise.get("update_rate", parameters.calibration.data.get("rate"))
+    rate = parameters.rate
     numbers = noise_values("vins", parameters.noise, rate)
     assert rate  # or it had been refused
     head = (
