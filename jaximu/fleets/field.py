@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 
 from jaximu.calibration.magnetometer import FieldStrength, field_start
 from jaximu.estimation.fitting import Fit
+from jaximu.estimation.problem import names_of
 from jaximu.fleets.fit import FleetUnit
 from jaximu.ground.document import Json
 from jaximu.ground.errors import FilePath, NotPossibleError
@@ -60,8 +61,8 @@ def field_row(magnetometer: FieldUnit, fit: Fit, rms: float) -> Json:
     factor = STANDARD_GRAVITY / magnetometer.field.value
     sigma = np.zeros(12)
     triad = fit.imu.accelerometer
-    places = [3 * name.axes[0] + name.axes[1] if name.part == "gain" else 9 + name.axes[0] for name in fit.names]
-    sigma[places] = fit.sigmas(factor * magnetometer.field.sigma)
+    every = names_of(fit.imu)
+    sigma[[every.index(name) for name in fit.names]] = fit.sigmas(factor * magnetometer.field.sigma)
     return {
         "mag_gain": factor * np.ravel(triad.gain),
         "mag_gain_sigma": factor * sigma[:9],

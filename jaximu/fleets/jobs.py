@@ -259,9 +259,12 @@ def listed_jobs(path: Path) -> list[Job] | None:
         rows = pq.read_table(path, columns=[name for name in _COLUMNS if name in names]).to_pylist()
     except (OSError, pa.ArrowException):  # which reading it as a log explains
         return None
-    stated = [_parse_options(row.pop("options", None) or "", str(path), Path()) for row in rows]
-    cells: list[Json] = [{name: text or "" for name, text in row.items()} for row in rows]
-    return [replace(Job(**row), options=options) for row, options in zip(cells, stated, strict=True)]
+    jobs = []
+    for row in rows:
+        cells: Json = {name: text or "" for name, text in row.items()}
+        cells["options"] = _parse_options(cells.get("options", ""), str(path), Path())
+        jobs.append(Job(**cells))
+    return jobs
 
 
 def options_text(options: Iterable[tuple[str, str]]) -> str:
@@ -290,29 +293,25 @@ def read_manifest(path: Path) -> list[Job] | None:
     jobs = []
     files = {}
     for number, row in rows:
+        where = f"{path}, row {number}"
         if len(row) != len(header):
-            raise InputError(f"{path}, row {number}: {len(row)} cells under {len(header)} column names.")
-        cells = {name: cell.strip() for name, cell in zip(header, row, strict=True)}
+            raise InputError(f"{where}: {len(row)} cells under {len(header)} column names.")
+        cells: Json = {name: cell.strip() for name, cell in zip(header, row, strict=True)}
         for name in (owner, "file"):
             if not cells[name]:
-                raise InputError(f"{path}, row {number}: the {name} is missing.")
+                raise InputError(f"{where}: the {name} is missing.")
         file = str(path.parent / cells["file"])
         if file in files:
-            raise InputError(f"{path}, row {number}: {cells['file']} stands in row {files[file]} already.")
+            raise InputError(f"{where}: {cells['file']} stands in row {files[file]} already.")
         files[file] = number
-        jobs.append(
-            Job(
-                cells[owner],
-                file,
-                cells.get("date", ""),
-                cells.get("lot", ""),
-                _parse_options(cells.get("options", ""), f"{path}, row {number}", path.parent),
-                str(path.parent / cells["static"]) if cells.get("static") else "",
-                cells.get("station", ""),
-                unit=cells.get("unit", ""),
-                session=cells.get("session", ""),
-            )
-        )
+        understood: Json = {
+            "device": cells[owner],
+            "file": file,
+            "options": _parse_options(cells.get("options", ""), where, path.parent),
+        }
+        if cells.get("static"):
+            understood["static"] = str(path.parent / cells["static"])
+        jobs.append(Job(**cells | understood))
     return jobs
 
 

@@ -36,7 +36,7 @@ from jaximu.noise.at_rest import fit_noise
 from jaximu.recordings.observations import Poses
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording
-from jaximu.recordings.segmentation import Segmentation, observed_poses, segment
+from jaximu.recordings.segmentation import observed_poses, segment
 
 PARAMETERS = names_of(Imu.nominal())
 """Names of the 24 numbers of a row, in the order of its column `covariance`."""
@@ -147,8 +147,7 @@ class ReadJob:
 
 def row_begun(job: Job) -> Json:
     """Return a job's row before anything is known of it but the job."""
-    known = {name: getattr(job, name) or None for name in _OF_JOB}
-    return dict.fromkeys(SCHEMA.names) | known
+    return dict.fromkeys(SCHEMA.names) | {name: getattr(job, name) or None for name in _OF_JOB}
 
 
 def read_job(job: Job, settings: Settings) -> ReadJob:
@@ -163,10 +162,12 @@ def read_job(job: Job, settings: Settings) -> ReadJob:
         choices = Choices(settings.gravity, noise, settings.segmentation)
         with prepared([recording], misfit=partial(carried_error, choices=choices)) as (ready,):
             segmentation = segment(ready.recording, settings.segmentation)
-            unit, notes = _unit(ready.recording, segmentation, settings, noise)
+            observations = observed_poses(segmentation, settings.gravity.value, noise=noise)
+            unit = FleetUnit(observations, nominal_imu(ready.recording), ready.recording.gyroscope is not None)
     except Exception as error:
         return ReadJob(row | _failure(error), None)
-    row |= _facts(ready.recording, unit, (*recording.notes, *ready.notes, *notes, *segmentation.notes))
+    of_noise = () if noise is None else noise.notes
+    row |= _facts(ready.recording, unit, (*recording.notes, *ready.notes, *of_noise, *segmentation.notes))
     if job.date:
         row["date"] = job.date
     if settings.diagnose:
@@ -184,14 +185,6 @@ def read_job(job: Job, settings: Settings) -> ReadJob:
 def noise_at_rest(path: str, options: ReadOptions) -> NoiseModel:
     """Fit a recording at rest; the last ones are kept, for a fleet that shares one."""
     return fit_noise(read_recording(path, None, options))
-
-
-def _unit(
-    recording: Recording, segmentation: Segmentation, settings: Settings, noise: NoiseModel | None
-) -> tuple[FleetUnit, tuple[str, ...]]:
-    observations = observed_poses(segmentation, settings.gravity.value, noise=noise)
-    notes = () if noise is None else noise.notes
-    return FleetUnit(observations, nominal_imu(recording), recording.gyroscope is not None), notes
 
 
 def _facts(recording: Recording, unit: FleetUnit, notes: Sequence[str]) -> Json:
@@ -286,7 +279,7 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> Js
         "weak": [direction.text for direction in weak],
         "notes": list(dict.fromkeys([*(row["notes"] or ()), *(finding.text for finding in unusual)])),
     }
-    if unit.gyroscope and row["turns"]:
+    if row["turns"]:
         row["gyro_rms"] = float(rms[1])
     if unit.gyroscope and row["session"]:
         row |= _at_rest(unit.observations.poses, fit.imu)
