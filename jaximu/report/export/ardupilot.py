@@ -76,7 +76,6 @@ FIRMWARE = ArduPilot()
 def write(parameters: ExportedUnit) -> Written:
     """Write offsets and scales of sensor `instance` (0, 1 or 2)."""
     parameters = parameters.for_autopilot("ArduPilot")
-    parameters.require_si("ArduPilot")
     number = parameters.instance or 0
     if number not in range(FIRMWARE.sensors):
         raise InputError(f"--instance: ArduPilot names its sensors 0, 1 and 2 here, not {number}.")

@@ -169,7 +169,11 @@ class ExportedUnit:
         return replace(self, triads=triads, maps=maps, frames=frames, axes=axes)
 
     def for_autopilot(self, name: str) -> ExportedUnit:
-        """Return the same in the axes of an autopilot: forward, right, down; as in its own log, if it is of that."""
+        """Return the same in the axes of an autopilot: forward, right, down; as in its own log, if it is of that.
+
+        Raises `NotPossibleError` where the outputs are counts, which no autopilot sees.
+        """
+        self.require_si(name)
         reading = self.calibration.reading
         if reading is None:  # as the log was, then
             return self._in(self.maps, self.maps, self.axes)

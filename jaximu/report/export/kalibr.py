@@ -55,7 +55,7 @@ def write(parameters: ExportedUnit) -> Written:
             f"\nw = transpose(C_gyro_i) inverse(M) (y - b - A C_gyro_i f)\nM = {exact_text(gyro)}"
             f"\nC_gyro_i = {exact_text(rotation)}\nA = {exact_text(sensitivity)}\nb = {bias}"
         )
-    lines += noise_lines(parameters, "  ")
+    lines += noise_lines(parameters)
     lines += ["  model: scale-misalignment", "  rostopic: /imu0", "  time_offset: 0.0"]
     turned = not np.allclose(frame, np.eye(3), atol=1e-9)
     convention = (
@@ -67,11 +67,11 @@ def write(parameters: ExportedUnit) -> Written:
     return Written(text_file(lines), convention, equation, corrections, frozenset({"gyro.g_sensitivity"}))
 
 
-def noise_lines(parameters: ExportedUnit, indent: str) -> list[str]:
+def noise_lines(parameters: ExportedUnit) -> list[str]:
     """The four densities and the rate as YAML; a number that is not known is a comment, never made up."""
     rate, known = parameters.rate, parameters.noise
     lines = [
-        f"{indent}{key}: {known[key]:.9e}" if key in known else f"{indent}# {key}: not known [{unit}]"
+        f"  {key}: {known[key]:.9e}" if key in known else f"  # {key}: not known [{unit}]"
         for key, unit in KALIBR_UNITS.items()
     ]
-    return lines if rate is None else [*lines, f"{indent}update_rate: {float(rate)!r}"]
+    return lines if rate is None else [*lines, f"  update_rate: {float(rate)!r}"]

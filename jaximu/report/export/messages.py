@@ -14,7 +14,6 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from operator import itemgetter
@@ -65,7 +64,7 @@ def write_messages(calibration: Calibration, raw: Recording, corrected: Recordin
         ) from None
     types = get_typestore(Stores.ROS2_HUMBLE)
     target = Path(path)
-    one_file = bool(Path(path).suffix)
+    one_file = bool(target.suffix)
     if not one_file and target.exists():
         raise InputError(f"{target} exists: name a new folder for the bag, or a file NAME.mcap.")
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}")
@@ -75,21 +74,18 @@ def write_messages(calibration: Calibration, raw: Recording, corrected: Recordin
     start = max(start, -first)  # stamps of ROS are not negative
     first += start
     try:
-        with ExitStack() as cleaned:
-            cleaned.callback(shutil.rmtree, temporary, ignore_errors=True)
-            with Writer(temporary, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
-                kinds = {stream.topic: stream.kind for stream in streams} | {"/diagnostics": _STATUS}
-                topics = {topic: bag.add_connection(topic, kind, typestore=types) for topic, kind in kinds.items()}
-                bag.write(topics["/diagnostics"], first, _status(calibration, types, first))
-                messages = (_messages(stream, start) for stream in streams)
-                for stamp, topic, content in heapq.merge(*messages, key=itemgetter(0)):
-                    bag.write(topics[topic], stamp, content)
-            (next(temporary.glob("*.mcap")) if one_file else temporary).replace(target)
+        with Writer(temporary, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
+            kinds = {stream.topic: stream.kind for stream in streams} | {"/diagnostics": _STATUS}
+            topics = {topic: bag.add_connection(topic, kind, typestore=types) for topic, kind in kinds.items()}
+            bag.write(topics["/diagnostics"], first, _status(calibration, types, first))
+            messages = (_messages(stream, start) for stream in streams)
+            for stamp, topic, content in heapq.merge(*messages, key=itemgetter(0)):
+                bag.write(topics[topic], stamp, content)
+        (next(temporary.glob("*.mcap")) if one_file else temporary).replace(target)
     except OSError as error:
         raise InputError(f"{target}: cannot be written: {error.strerror or error}.") from error
     finally:
-        with suppress(OSError):
-            shutil.rmtree(temporary, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 _STATUS = "diagnostic_msgs/msg/DiagnosticArray"

@@ -50,7 +50,7 @@ def write(parameters: ExportedUnit) -> Written:
         biases.append(f"  # gyroscope bias {gyro_bias} rad/s: OpenVINS estimates it, see init_dyn_bias_g")
         corrections["gyroscope"] = Correction(rotation.T @ np.linalg.inv(blocks["Tw"]), zero, sensitivity, frame)
     lines = ["%YAML:1.0", "", comments(parameters), "imu0:", *yaml_matrices({"T_i_b": np.eye(4)}, 2, 4)]
-    lines += [*noise_lines(parameters, "  "), "  rostopic: /imu0", "  time_offset: 0.0", '  model: "kalibr"']
+    lines += [*noise_lines(parameters), "  rostopic: /imu0", "  time_offset: 0.0", '  model: "kalibr"']
     lines += [*yaml_matrices(blocks, 2, 4), *biases]
     equation = (
         "f = transpose(R_IMUtoACC) inverse(Ta) (y_a - b_a); w = transpose(R_IMUtoGYRO) inverse(Tw) (y_g - b_g - Tg f)\n"

@@ -72,7 +72,6 @@ FIRMWARE = PX4()
 def write(parameters: ExportedUnit) -> Written:
     """Write offsets and scales of sensor `instance`; its device's ID only if it was stated."""
     parameters = parameters.for_autopilot("PX4")
-    parameters.require_si("PX4")
     values, equation, corrections, rotation = FIRMWARE.values(parameters)
     identities = {
         name: FIRMWARE.parameter(FIRMWARE.identity, name, parameters.instance or 0) for name in parameters.triads
