@@ -163,14 +163,14 @@ def _total_rows(consequences: Consequences) -> Iterator[tuple[str, ...]]:
             yield what + direction, *map(words, sigma[rows, 3 * part + axis])
 
 
-def _statements(consequences: Consequences) -> list[Statement]:
+def _statements(consequences: Consequences) -> Iterator[Statement]:
     last = _at_end(consequences.total)
     end = _end(consequences)
     parts = [
         f"{name} from {round(start, 1):g} to {round(stop, 1):g} s" for name, start, stop in consequences.dominant()
     ]
     more = f" and {len(parts) - 6} changes more" if len(parts) > 6 else ""
-    texts = {"What dominates when": sentence(f"{'; '.join(parts[:6])}{more}.")}
+    yield Statement("What dominates when", sentence(f"{'; '.join(parts[:6])}{more}."))
 
     def better(variances: FloatArray) -> float:
         return _at_end(variances + consequences.noise)
@@ -183,34 +183,37 @@ def _statements(consequences: Consequences) -> list[Statement]:
     )
     if consequences.noise.any():
         buys += f" Noise alone leaves {_metres(_at_end(consequences.noise))}, which no calibration can undo."
-    texts["What a better calibration buys"] = buys
+    yield Statement("What a better calibration buys", buys)
     apart = np.sqrt(sum(_at_end(consequences.terms[name]) ** 2 for name in consequences.known))
     together = _at_end(consequences.calibration)
     if abs(together / apart - 1) > _COMMON:
-        texts["Correlation"] = (
+        yield Statement(
+            "Correlation",
             f"The calibration's terms are not independent: together they make {_metres(together)} after {end}, where "
-            f"their root sum of squares would be {_metres(apart)}."
+            f"their root sum of squares would be {_metres(apart)}.",
         )
     if consequences.left_out:
         lost = sorted(consequences.left_out.items(), key=lambda pair: -pair[1][-1])
         listed = "; ".join(f"{name} {_metres(error[-1])}" for name, error in lost)
-        texts["What a simpler model costs"] = f"Left out of the correction, each by itself, after {end}: {listed}."
+        text = f"Left out of the correction, each by itself, after {end}: {listed}."
+        yield Statement("What a simpler model costs", text)
     if consequences.check is not None:
         ratio = _at_end(consequences.check.sigma**2) / last
         draws = len(consequences.check.errors)
         chance = Z95 / np.sqrt(2 * draws)
-        texts["Check"] = (
+        yield Statement(
+            "Check",
             f"{draws} draws of all errors, through the whole mechanisation, scatter {ratio:.2f} times as much as the "
-            f"budget says after {end} (by chance {1 - chance:.2f} to {1 + chance:.2f})."
+            f"budget says after {end} (by chance {1 - chance:.2f} to {1 + chance:.2f}).",
         )
     if consequences.against is not None and consequences.apart is not None:
         other = _metres(_at_end(consequences.against.total))
         off = _metres(float(np.linalg.norm(consequences.apart[-1, :3])))
-        texts["The other calibration"] = (
+        yield Statement(
+            "The other calibration",
             f"With {Path(consequences.against.calibration_file).name} position is off by {other} (1σ) after "
-            f"{end} if it is right, and it puts the unit {off} from where this one does."
+            f"{end} if it is right, and it puts the unit {off} from where this one does.",
         )
-    return [Statement(about, text) for about, text in texts.items()]
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
@@ -220,8 +223,7 @@ def _budget_figure(consequences: Consequences) -> Figure:
     variances = {name: position(term) ** 2 for name, term in consequences.terms.items()}
     times = consequences.times
     whole = np.maximum(np.sum(list(variances.values()), axis=0), 1e-300)
-    visible = [name for name in _order(consequences) if (variances[name] / whole).max() >= LEAST_SHARE]
-    drawn = visible[: len(PALETTE)]
+    drawn = [name for name in _order(consequences) if (variances[name] / whole).max() >= LEAST_SHARE][: len(PALETTE)]
     end = f"after {_end(consequences)}"
     figure, (above, below) = figures.stacked(2, 3.2, sharex=True)
     for name, color in zip(drawn, PALETTE, strict=False):

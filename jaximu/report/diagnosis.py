@@ -359,8 +359,8 @@ def _cost(diagnosis: Diagnosis) -> Iterator[Statement]:
         f"{effect.effect.title} changes the {effect.triad}'s output by up to {effect.size()}"
         for effect in diagnosis.named
     ]
-    if diagnosis.learned is not None and not diagnosis.learned.drift:
-        learned = diagnosis.learned
+    learned = diagnosis.learned
+    if learned is not None and not learned.drift:
         peak = np.unravel_index(np.abs(learned.y).argmax(), learned.y.shape)
         swing = with_interval(abs(learned.y[peak]), learned.half_width[peak] / Z95, SENSOR_UNITS[learned.triad])
         outputs.append(f"{learned.covariate} changes the {learned.triad}'s output by up to {swing} (95 %)")
@@ -516,11 +516,10 @@ def _ranking(panel: Axes, diagnosis: Diagnosis) -> None:
     # many may reach the end of the axis: what was named comes first among them
     order = sorted(best, key=lambda name: (best[name], name not in named))[:_SHOWN][::-1]
     rivals = {name for effect in diagnosis.effects for name in effect.rivals}
-    colours = [_EXTENDED if n in named else ("#56B4E9" if n in rivals else "#C4C4C4") for n in order]
     panel.barh(
         [effect_title(name).replace(" (", "\n(") for name in order],
         [-np.log10(best[name]) for name in order],
-        color=colours,
+        color=[_EXTENDED if n in named else ("#56B4E9" if n in rivals else "#C4C4C4") for n in order],
     )
     panel.axvline(-np.log10(evidence.critical(0.05)), color="black", linestyle="--", linewidth=1)
     dressed(panel, "each effect, tested alone", xlabel="evidence: −log₁₀ of the p-value")

@@ -102,8 +102,8 @@ class LivePage:
         return str(self._macros.goals(f"{count} pose{'s' * (count != 1)} count{'s' * (count == 1)}", goals))
 
     def _unit(self, name: str, attitude: FloatArray, alternative: str) -> str:
-        picture = Picture(name, partial(_unit_figure, attitude), alternative)
-        return self._kept(name, (attitude / _STEP).round().tobytes(), lambda: picture)
+        draw = partial(_unit_figure, attitude)
+        return self._kept(name, (attitude / _STEP).round().tobytes(), lambda: Picture(name, draw, alternative))
 
     def _map(self, moment: Moment, over: bool) -> str:
         ups = moment.ups

@@ -95,7 +95,7 @@ def _instructions(proposal: Proposal) -> Iterator[str]:
             f"From one to the next, turn the direct way in about {equipment.turn:g} s, and record without a break. "
             "A pose that is missed by some ten degrees costs little: the recording shows its true orientation."
         )
-    elif equipment.accuracy is not None:
+    elif equipment.robot:
         yield (
             f"From one to the next, turn about the stated axis in {equipment.turn:g} s, the rate rising in the first "
             "fifth of it and falling in the last. Record without a break, and log the robot's attitude throughout: its "
@@ -115,7 +115,7 @@ def _next(proposal: Proposal) -> str:
     command, earlier = "turntable LOG --reference schedule.csv", ""
     if equipment.by_hand:
         command, earlier = "calibrate LOG", " with earlier recordings beside LOG"
-    elif equipment.accuracy is not None:
+    elif equipment.robot:
         command = "reference LOG --reference REF"
     elif equipment.in_sequence:
         command = "filter LOG"

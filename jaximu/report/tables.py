@@ -76,11 +76,11 @@ def snippet(calibration: Calibration) -> str:
     return "\n".join(lines)
 
 
-def _scaled(values: FloatArray, digits: int = 7) -> tuple[str, list[list[str]]]:
-    """Return a common power of ten if needed, and a matrix's entries as text with the decimals of the largest."""
+def _scaled(values: FloatArray) -> tuple[str, list[list[str]]]:
+    """Return a common power of ten if needed, and a matrix's entries as text, the largest with seven digits."""
     size = int(np.floor(np.log10(np.abs(values).max(initial=1e-300))))
     power = 0 if -2 <= size <= 5 else size
-    decimals = max(0, digits - 1 - (size - power))
+    decimals = max(0, 6 - (size - power))
     cells = [
         [f"{value:.{decimals}f}".replace("-", "−") if value else "0" for value in row] for row in values / 10.0**power
     ]

@@ -24,7 +24,7 @@ from jaximu.ground.units import PREFIXES, SENSOR_UNITS
 from jaximu.mistakes.titles import effect_title
 from jaximu.planning.ramps import next_ramps
 from jaximu.recordings.recording import Recording, smoothed_slope
-from jaximu.report.canvas import Figure
+from jaximu.report.canvas import Axes, Figure
 from jaximu.report.export.thermal_autopilot import AutopilotParameters
 from jaximu.report.figures import beside, dressed, legend, new_figure
 from jaximu.report.words import compensation, file_names, how_much_smaller
@@ -289,10 +289,6 @@ def _ways(thermal: ThermalCalibration) -> list[Part]:
     then = options[0].parts
     if all(then[name].apart < _WORTH * now[name].apart for name in weak):
         return []
-    shares = Table(
-        ("effect", "share that no other can imitate, now", "with that ramp"),
-        [(name.replace("_", " "), *(_share(parts[name].apart) for parts in (now, then))) for name in weak],
-    )
     return [
         Statement(
             "What to record next",
@@ -300,7 +296,10 @@ def _ways(thermal: ThermalCalibration) -> list[Part]:
             "recordings to `jaximu thermal`: of the ramps tried it separates best what looks alike now.",
             True,
         ),
-        shares,
+        Table(
+            ("effect", "share that no other can imitate, now", "with that ramp"),
+            [(name.replace("_", " "), *(_share(parts[name].apart) for parts in (now, then))) for name in weak],
+        ),
     ]
 
 
@@ -363,13 +362,19 @@ def bias_dots(thermal: ThermalCalibration, name: str) -> FloatArray:
     return thermal.fits[name].fitted + residual_dots(thermal, name)
 
 
-def _both_ways(thermal: ThermalCalibration) -> list[tuple[np.ndarray, dict[str, str]]]:
+def _both_ways(thermal: ThermalCalibration) -> list[tuple[np.ndarray, dict[str, Any]]]:
     """Return the blocks while it warms and while it cools, as masks (n,), and how they are drawn."""
     up = np.zeros(len(thermal.blocks), bool)
     for leg in thermal.identifiability.legs:
         up[leg.blocks] = leg.up
     parts = [(up, {"color": "#D55E00", "label": "warming"}), (~up, {"color": "#0072B2", "label": "cooling"})]
     return [(part, style) for part, style in parts if part.any()]
+
+
+def _plot_both_ways(panel: Axes, thermal: ThermalCalibration, x: FloatArray, y: FloatArray, dot: float) -> None:
+    """Draw values (n,) of the blocks as dots this large, in one colour while it warms and another while it cools."""
+    for part, style in _both_ways(thermal):
+        panel.plot(x[part], y[part], ".", ms=dot, **style)
 
 
 def _within_data(thermal: ThermalCalibration, temperature: FloatArray, rates: FloatArray) -> np.ndarray:
@@ -402,14 +407,13 @@ def surface_figure(thermal: ThermalCalibration, name: str) -> Figure:
     surface = np.stack([thermal.bias(name, temperature, rate)[0] for rate in rates])  # (r, m, 3)
     drawn = _within_data(thermal, temperature, rates)
     data = bias_dots(thermal, name)
-    parts = _both_ways(thermal)
     x, y = np.meshgrid(temperature, 60 * rates)
     for axis in range(3):
         panel: Any = figure.add_subplot(1, 3, axis + 1, projection="3d")
         cells = _cells(np.stack([x, y, factor * surface[:, :, axis]], axis=-1), drawn)
         panel.add_collection3d(Poly3DCollection(cells, facecolors="#888888", alpha=0.45, linewidth=0))
         panel.auto_scale_xyz(*cells.reshape(-1, 3).T)
-        for part, style in parts:
+        for part, style in _both_ways(thermal):
             few = np.flatnonzero(part)[:: 1 + len(blocks) // _MOST_DOTS]
             panel.scatter(
                 blocks.temperature[few],
@@ -431,12 +435,10 @@ def band_figure(thermal: ThermalCalibration, name: str) -> Figure:
     factor, unit = _unit(thermal, name)
     temperature = np.linspace(*thermal.blocks.range, 201)
     value, sigma = thermal.bias(name, temperature)
-    data = bias_dots(thermal, name)
-    parts = _both_ways(thermal)
+    data = factor * bias_dots(thermal, name)
     figure, panels = beside(3, 3.4)
     for axis, panel in enumerate(panels):
-        for part, style in parts:
-            panel.plot(thermal.blocks.temperature[part], factor * data[part, axis], ".", ms=2.5, **style)
+        _plot_both_ways(panel, thermal, thermal.blocks.temperature, data[:, axis], 2.5)
         low, high = (factor * (value + sign * Z95 * sigma)[:, axis] for sign in (-1, 1))
         panel.fill_between(temperature, low, high, color="0.5", alpha=0.35, linewidth=0)
         panel.plot(temperature, factor * value[:, axis], color="black", lw=1.1, label="steady, with 95 % band")
@@ -451,12 +453,10 @@ def residual_figure(thermal: ThermalCalibration, name: str) -> Figure:
     blocks = thermal.blocks
     residual = factor * residual_dots(thermal, name)
     figure = new_figure(6.0)
-    parts = _both_ways(thermal)
     grid = figure.subplots(3, 2, sharey="row", sharex="col")
     for row, axis, values in zip(grid, "xyz", residual.T, strict=True):
         for panel, x in zip(row, (blocks.temperature, blocks.time / 3600), strict=True):
-            for part, style in parts:
-                panel.plot(x[part], values[part], ".", ms=3, **style)
+            _plot_both_ways(panel, thermal, x, values, 3)
             dressed(panel, level=0.0)
         row[0].set_ylabel(f"{name} {axis} [{unit}]", fontsize=9)
     dressed(grid[0, 0], "Residual bias by temperature")
@@ -471,9 +471,8 @@ def covered_figure(thermal: ThermalCalibration) -> Figure:
     """Draw the temperatures and rates that the recordings went through."""
     blocks = thermal.blocks
     figure, (left, right) = beside(2, 3.4)
-    for part, style in _both_ways(thermal):
-        left.plot(blocks.temperature[part], 60 * blocks.rate[part], ".", ms=4, **style)
-        right.plot(blocks.time[part] / 3600, blocks.temperature[part], ".", ms=3, **style)
+    _plot_both_ways(left, thermal, blocks.temperature, 60 * blocks.rate, 4)
+    _plot_both_ways(right, thermal, blocks.time / 3600, blocks.temperature, 3)
     dressed(
         left,
         "Temperatures and rates covered",

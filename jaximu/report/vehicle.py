@@ -115,10 +115,7 @@ def _figure(calibration: Calibration, vehicle: Mapping[str, Any], history: Histo
     scale = calibration.triads()["gyroscope"].scales
     figure, (bias, tilt, speed) = stacked(3, 2.5, 0.0)
     for row, (axis, color) in enumerate(AXES.items()):
-        values, sigmas = (
-            np.degrees(history.values[:, row] / scale[row]),
-            np.degrees(history.sigmas[:, row] / scale[row]),
-        )
+        values, sigmas = (np.degrees(part[:, row] / scale[row]) for part in (history.values, history.sigmas))
         band(bias, history.time, values - values[-1], Z95 * sigmas, color, label=axis)
     limit = 3 * np.degrees(Z95 * np.max(history.sigmas[len(history.time) // 2 :] / scale))
     bias.set_ylim(-limit, limit)

@@ -159,11 +159,11 @@ def gravity_statements(calibration: Calibration) -> Iterator[Statement]:
     if "accelerometer" not in triads:
         return
     if not gravity.sigma > 0:
-        text = (
+        yield Statement(
+            "Gravity",
             f"Gravity was taken as exactly {gravity.value:.5f} m/s². Were it off by 0.001 m/s², all three scales of "
-            "the accelerometer would be off by 0.01 %; the intervals do not include that."
+            "the accelerometer would be off by 0.01 %; the intervals do not include that.",
         )
-        yield Statement("Gravity", text)
         return
     share = 100 * Z95 * gravity.sigma / gravity.value
     sigmas = sigmas_of(calibration.covariance_of([Name("accelerometer", "gain", (k, k)) for k in range(3)]))
@@ -193,24 +193,25 @@ def limits(calibration: Calibration, errors: PoseAndTurnErrors | None = None) ->
     if errors is not None:
         gap, where = largest_gap(errors.directions)
         if gap > 60:
-            text = (
+            yield Statement(
+                "Orientations",
                 f"The direction {direction_words(where)} is {gap:.0f}° away from every direction that pointed up in a "
-                "pose: what the accelerometer does there is extrapolated. Record poses there."
+                "pose: what the accelerometer does there is extrapolated. Record poses there.",
+                True,
             )
-            yield Statement("Orientations", text, True)
     if "gravity_norm" in calibration.rms:
-        text = (
+        yield Statement(
+            "The case",
             "The body frame is the accelerometer's: x along its x axis, y in the plane of its x and y axes. How it is "
             "turned against the case cannot be seen without a reference; three entries of the accelerometer's gain are "
-            "zero for this reason."
+            "zero for this reason.",
         )
-        yield Statement("The case", text)
     elif "poses" in calibration.data:
-        text = (
+        yield Statement(
+            "The fixture",
             "The body frame is the fixture's, in which the reference states its directions; how the fixture is turned "
-            "against the table cannot be distinguished from misalignment."
+            "against the table cannot be distinguished from misalignment.",
         )
-        yield Statement("The fixture", text)
     missing = "temperature, nonlinearity, time lags, ageing"
     if "gyroscope" in triads:
         missing += ", the gyroscope's sensitivity to acceleration"
