@@ -232,7 +232,7 @@ def compare(
     names, left_out = _comparable(epochs)
     covariance = _covariance(epochs, names)
     movements = _courses(epochs, names, covariance, times, level)
-    together = _together(movements, np.array([movement.values for movement in movements]).T, covariance)
+    together = _together(movements, covariance)
     output, silent = _outputs(epochs[0], epochs[-1], names, rate)
     reached, unknown = _limits_reached(movements, limits, epochs[0].calibration)
     return UnitHistory(
@@ -413,7 +413,8 @@ def _kind(name: str) -> str:
     return "effects" if stem in CATALOGUE else f"{owner} {'bias' if part == 'bias' else 'gain'}"
 
 
-def _together(movements: Sequence[Movement], values: FloatArray, covariance: FloatArray) -> dict[str, Sameness]:
+def _together(movements: Sequence[Movement], covariance: FloatArray) -> dict[str, Sameness]:
+    values = np.array([movement.values for movement in movements]).T
     count, size = values.shape
 
     def test(chosen: list[int]) -> Sameness:

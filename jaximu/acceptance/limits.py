@@ -39,7 +39,7 @@ from typing import Any
 import numpy as np
 
 from jaximu.acceptance.decision import Rule, probability_of_conformity
-from jaximu.acceptance.words import between, parts_of
+from jaximu.acceptance.words import between, parts_of, si_unit
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import Json, file_digest, read_toml
 from jaximu.ground.errors import FilePath, InputError, only
@@ -219,10 +219,7 @@ def _meaning(key: str, where: str) -> tuple[str, str, tuple[int, ...], str]:
         or (part == "misalignment" and len(set(axes)) == 1)
     ):
         raise InputError(f"{where}: axes are [0], [1], [2]; of a misalignment two that differ, [1,0].")
-    base = (
-        SI_UNITS[SENSOR_QUANTITIES[owner]][part] if part in "QNBKR" else {"scale": "1", "misalignment": "rad"}.get(part)
-    )
-    return owner, part, axes, base or SENSOR_UNITS[owner]
+    return owner, part, axes, SI_UNITS[SENSOR_QUANTITIES[owner]][part] if part in "QNBKR" else si_unit(key)
 
 
 def _value(stated: Any, base: str, where: str) -> float:

@@ -106,20 +106,22 @@ class DiagnoseCommand(options.Fits):
 
     def _measured(self) -> bool:
         """Whether the reference is a measured attitude. Raises `InputError` where options contradict each other."""
-        if self.thermal and self.reference is not None:
+        if self.reference is None:
+            if self.heldout_reference is not None:
+                raise InputError("--heldout-reference goes with --reference.")
+            return False
+        if self.thermal:
             raise InputError("--thermal is for recordings at rest, --reference for poses and turns: give one of them.")
-        if self.reference is not None and len(self.logs) != 1:
+        if len(self.logs) != 1:
             raise InputError(f"--reference goes with one LOG, found {len(self.logs)}.")
         options.require_files(self.reference)
         from jaximu.recordings.readers import holds_attitude
 
-        measured = self.reference is not None and holds_attitude(self.reference)
+        measured = holds_attitude(self.reference)
         if measured and (self.heldout is not None or self.heldout_reference is not None):
             raise InputError("with a measured attitude the gain is measured on parts of LOG left out: omit --heldout.")
-        if self.reference is not None and (self.heldout is None) != (self.heldout_reference is None):
+        if (self.heldout is None) != (self.heldout_reference is None):
             raise InputError("with --reference, --heldout LOG and --heldout-reference REF go together.")
-        if self.reference is None and self.heldout_reference is not None:
-            raise InputError("--heldout-reference goes with --reference.")
         return measured
 
     def _jobs(self) -> list[Job] | None:

@@ -10,6 +10,7 @@ from tyro.conf import Positional
 import jaximu
 from jaximu.cli import options
 from jaximu.cli.options import option, takes_options
+from jaximu.cli.usage import paragraphs_about
 from jaximu.ground.document import Json, entries
 from jaximu.ground.errors import InputError
 from jaximu.ground.page import Page, Section, Table
@@ -54,8 +55,9 @@ class EffectsCommand:
 
 
 def _entry(kind: type[jaximu.Effect]) -> Json:
-    plain = "name", "formula", "unit", "scope", "needs", "excited_by", "look_alikes", "typical", "recovery", "source"
-    return entries(kind, *plain) | {
+    return {
+        **entries(kind, "name", "formula", "unit", "scope", "needs", "excited_by", "look_alikes", "typical"),
+        **entries(kind, "recovery", "source"),
         "description": inspect.getdoc(kind),
         "coefficients": kind.size,
         "inner": {name: parameter._asdict() for name, parameter in kind.inner.items()},
@@ -100,5 +102,4 @@ def _page(kind: type[jaximu.Effect]) -> Page:
         usual = joined(plain(parameter.typical), unit_text(parameter.unit))
         text = f"{parameter.meaning}; {usual}, from {plain(parameter.low)} to {plain(parameter.high)}"
         rows.append((inner.replace("_", " "), text))
-    text = [" ".join(paragraph.split()) for paragraph in (inspect.getdoc(kind) or "").split("\n\n")]
-    return Page(kind.title, (kind.formula,), first=(*text, Table((), rows)))
+    return Page(kind.title, (kind.formula,), first=(*paragraphs_about(kind), Table((), rows)))

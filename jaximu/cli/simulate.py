@@ -12,6 +12,7 @@ from tyro.conf import Positional
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
 from jaximu.cli.options import option, switch, takes_options
+from jaximu.cli.usage import paragraphs_about
 from jaximu.ground.errors import InputError
 from jaximu.ground.page import Code, Page, Section
 from jaximu.ground.reexport import later
@@ -89,8 +90,7 @@ def _protocols() -> Page:
     parts = []
     for kind, protocol in PROTOCOLS.items():
         keys = [key.name + ("" if key.default is MISSING else f" = {_toml(key.default)}") for key in fields(protocol)]
-        text = [" ".join(paragraph.split()) for paragraph in (inspect.getdoc(protocol) or "").split("\n\n")]
-        parts.append(Section(kind, (*text, Code("\n".join(keys)))))
+        parts.append(Section(kind, (*paragraphs_about(protocol), Code("\n".join(keys)))))
     return Page("Protocols and their keys", (), first=parts)
 
 

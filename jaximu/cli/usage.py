@@ -77,6 +77,11 @@ def options_of(command: type[Any]) -> list[OptionHelp]:
     return helps
 
 
+def paragraphs_about(documented: object) -> list[str]:
+    """Return the paragraphs of what a class says of itself, each as one line."""
+    return [" ".join(paragraph.split()) for paragraph in (inspect.getdoc(documented) or "").split("\n\n")]
+
+
 def _option(name: str, hint: object, default: object, group: str) -> OptionHelp:
     arguments = typing.get_args(hint) if typing.get_origin(hint) is typing.Annotated else (hint,)
     stated = next((argument for argument in arguments[1:] if hasattr(argument, "metavar")), None)
@@ -146,8 +151,7 @@ def listed(groups: Mapping[str, str], verb: Callable[[str], type[Any]]) -> str:
     for group, names in groups.items():
         lines.append(f"{group}:")
         for name in names.split():
-            text = " ".join((inspect.getdoc(verb(name)) or "").partition("\n\n")[0].split())
-            lines += _lines(name, text, width, 17)
+            lines += _lines(name, paragraphs_about(verb(name))[0], width, 17)
         lines.append("")
     rest = [
         ("--help", "Show this overview; after a verb, its options and examples."),

@@ -123,7 +123,7 @@ class Filter:
     def rested(self) -> Knowledge:
         """Return what is known after the first rest, z up."""
         measurement, first = self.measured(_CHOICES[:1])
-        rows, start = self._rows(measurement, slice(0, first))
+        rows, start = self._rows(measurement, 0, first)
         return run(self.begun(), self._headed(rows, start.inv()))[0]
 
     def rotated(self, known: Knowledge, attitude: Rotation, word: str) -> Knowledge:
@@ -132,7 +132,7 @@ class Filter:
         key = word, *up.astype(int).tolist()
         if key not in self._legs:
             measurement, first = self.measured([word], _BEFORE, up.tolist())
-            rows, start = self._rows(measurement, slice(first, int(np.sum(measurement.intervals.real))))
+            rows, start = self._rows(measurement, first)
             self._legs[key] = _merged(rows), start
         rows, start = self._legs[key]
         return run(known, self._headed(rows, attitude * start.inv()))[0]
@@ -144,7 +144,7 @@ class Filter:
         and the Earth's rotation.
         """
         measurement, _ = self.measured(words)
-        rows, start = self._rows(measurement, slice(0, int(np.sum(measurement.intervals.real))))
+        rows, start = self._rows(measurement)
         initial = self.begun()
         states = self.errors.states
         if not known:
@@ -167,12 +167,18 @@ class Filter:
         spread = submatrix(self.numbers(known) / self.size[:, None] / self.size, kept)
         return float(stored.call(CRITERIA[criterion], f"sequence's {criterion}", spread, weights[kept]))
 
-    def _rows(self, measurement: IntervalsOfMotion, part: slice) -> tuple[WhiteRows, Rotation]:
-        """Return rows of some intervals about the free numbers and gravity, and the attitude where they begin."""
+    def _rows(
+        self, measurement: IntervalsOfMotion, first: int = 0, stop: int | None = None
+    ) -> tuple[WhiteRows, Rotation]:
+        """Return rows of intervals about the free numbers and gravity, and the attitude where they begin.
+
+        They go from `first` to `stop`, or to the last that is real.
+        """
+        part = slice(first, int(np.sum(measurement.intervals.real)) if stop is None else stop)
         filtered = measurement.filtered(self.imu)
         shared = np.append(self.index, len(flatten(self.imu)))
         rows = WhiteRows(*(np.asarray(array)[part] for array in filtered.rows))
-        start = Rotation.from_quat(np.asarray(filtered.path.attitude)[part.start], scalar_first=True)
+        start = Rotation.from_quat(np.asarray(filtered.path.attitude)[first], scalar_first=True)
         return rows._replace(shared=rows.shared[..., shared]), start
 
     def _headed(self, rows: WhiteRows, ahead: Rotation) -> WhiteRows:
