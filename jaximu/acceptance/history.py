@@ -79,10 +79,9 @@ class Movement:
 
     def document(self, per: str) -> Json:
         """Return it as JSON has it; `per`: unit of time."""
-        plain = entries(
-            self, "name", "unit", "values", "sigmas", "difference", "sigma", "z", "p_value", "moved", "tested"
-        )
-        return plain | {
+        return {
+            **entries(self, "name", "unit", "values", "sigmas", "difference", "sigma", "z", "p_value"),
+            **entries(self, "moved", "tested"),
             "p_value_all_allowed_for": self.adjusted if self.tested else None,
             "drift": self.line.document() | {"unit": f"{self.unit} per {per}"},
         }

@@ -344,6 +344,5 @@ def _parse_options(text: str, where: str, folder: Path) -> tuple[tuple[str, str]
 
 def batches(places: Sequence[int], settings: Settings, workers: int) -> list[list[int]]:
     """Cut places into batches: large enough for a compiled program, small enough to share and to lose."""
-    largest = 8 if settings.diagnose else 64
-    size = max(1, min(largest, -(-len(places) // (2 * workers))))
+    size = max(1, min(8 if settings.diagnose else 64, -(-len(places) // (2 * workers))))
     return [list(places[first : first + size]) for first in range(0, len(places), size)]

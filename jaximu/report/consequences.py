@@ -195,8 +195,9 @@ def _statements(consequences: Consequences) -> Iterator[Statement]:
     if consequences.left_out:
         lost = sorted(consequences.left_out.items(), key=lambda pair: -pair[1][-1])
         listed = "; ".join(f"{name} {_metres(error[-1])}" for name, error in lost)
-        text = f"Left out of the correction, each by itself, after {end}: {listed}."
-        yield Statement("What a simpler model costs", text)
+        yield Statement(
+            "What a simpler model costs", f"Left out of the correction, each by itself, after {end}: {listed}."
+        )
     if consequences.check is not None:
         ratio = _at_end(consequences.check.sigma**2) / last
         draws = len(consequences.check.errors)
