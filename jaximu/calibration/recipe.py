@@ -308,12 +308,7 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     fitted = fit_hand_held(nominal, observations, method, loss)
     where = ", ".join(recording.name for recording in recordings)
     poses, turns = (int(part.mask.sum()) for part in (observations.poses, observations.turns))
-    try:
-        require_determined(fitted, where, poses=poses)
-    except NotPossibleError:
-        if turns and method != "accelerometer":  # which leave all open where nothing explains them
-            require_carried(residual_rms(fitted.imu, observations)["gravity_direction"][0], where)
-        raise
+    require_determined(fitted, where, poses=poses)
     fitted, held = with_open_misalignments_held(fitted, nominal, observations, method, loss)
     require_determined(fitted, where, prior=held)
     keep_gyroscope = method != "accelerometer"

@@ -28,6 +28,8 @@ _SLOWEST = 1.0
 """Hz: no log of poses and turns has a lower rate."""
 _SUDDEN = 0.3
 """Share of the mean interval below which two samples arrived together."""
+_PAUSE = 1.5
+"""Times the mean interval, from which on nothing arrived between two bursts."""
 _LASTING = 20
 """Samples over whose mean a steady clock must not be late."""
 _SURE = 14.0
@@ -51,13 +53,13 @@ def _timing(name: str, sensor: Sensor, alike: Sequence[Sensor]) -> Iterator[Find
     interval = sensor.interval
     mean = np.mean(interval)
     if in_bursts(interval):
-        rate, lag = 1 / _clock(sensor.time)[1], np.quantile(interval, 0.99)
+        rate, lag = 1 / _clock(sensor.time)[1], np.median(interval[interval > _PAUSE * mean])
         yield Finding(
             "data.bursts",
-            sensor.rows(np.flatnonzero(interval > 1.8 * mean)[:5] + 1),
+            sensor.rows(np.flatnonzero(interval > _PAUSE * mean)[:5] + 1),
             f"{name}: the stamps come in bursts, {lag * 1e3:.3g} ms apart: they are the times of arrival at the "
-            f"host. A steady clock of {rate:.5g} Hz fitted to them replaces them; let the sensor's own clock be "
-            "logged if it can be.",
+            f"host, or were cut to a coarser clock. A steady clock of {rate:.5g} Hz fitted to them replaces them; let "
+            "the sensor's own clock be logged, with all its digits.",
             apply=steady_clock,
         )
         return
@@ -89,30 +91,34 @@ def _timing(name: str, sensor: Sensor, alike: Sequence[Sensor]) -> Iterator[Find
             f"{interval[gaps].max():.3g} s, after {sensor.time[gaps[np.argmax(interval[gaps])]]:.1f} s. Turns across "
             "long gaps are left out.",
         )
-    spread = np.std(interval[missing == 0])
-    if spread > UNEVEN * mean:
-        even = _even(sensor.time)
-        evidence = 0.0 if even is None else sum(_taken_evenly(one, even) for one in alike)
-        grid = _grid(interval[missing == 0])
-        text = (
-            f"{name}: stamps jitter by {1e3 * spread:.2g} ms from sample to sample, {100 * spread / mean:.0f} % of the "
-            f"interval{f', in steps of {1e3 * grid:.3g} ms, as a logger polls' if grid > spread else ''}"
+    kept = interval[missing == 0]
+    if np.std(kept) > UNEVEN * mean:
+        yield _jitter(name, sensor, alike, kept)
+
+
+def _jitter(name: str, sensor: Sensor, alike: Sequence[Sensor], interval: FloatArray) -> Finding:
+    """Return what is said of uneven intervals (n,): samples were taken evenly, or at the stamps, as motion shows."""
+    even, grid, spread = _even(sensor.time), _grid(interval), np.std(interval)
+    evidence = 0.0 if even is None else sum(_taken_evenly(one, even) for one in alike)
+    text = (
+        f"{name}: stamps jitter by {1e3 * spread:.2g} ms from sample to sample, {100 * spread / interval.mean():.0f} % "
+        f"of the interval{f', in steps of {1e3 * grid:.3g} ms, as a logger polls' if grid > spread else ''}"
+    )
+    apply = None
+    if even is not None and evidence > _SURE:
+        apply = partial(_evenly, sensor=sensor, even=even)
+        text += (
+            f", and the samples were taken at even times: a steady clock of {1 / np.median(np.diff(even)):.5g} Hz "
+            "fitted to the stamps replaces them."
         )
-        apply = None
-        if even is not None and evidence > _SURE:
-            apply = partial(_evenly, sensor=sensor, even=even)
-            text += (
-                f", and the samples were taken at even times: a steady clock of {1 / np.median(np.diff(even)):.5g} Hz "
-                "fitted to the stamps replaces them."
-            )
-        elif evidence < -_SURE:
-            text += ", and the samples were taken at the times of the stamps, which are used as they are."
-        else:
-            text += (
-                ". If the sensor samples evenly, its own clock is better than the logger's: leave the time column out "
-                "(_ in --columns) and give --rate."
-            )
-        yield Finding("data.jitter", (), text, apply=apply)
+    elif evidence < -_SURE:
+        text += ", and the samples were taken at the times of the stamps, which are used as they are."
+    else:
+        text += (
+            ". If the sensor samples evenly, its own clock is better than the logger's: leave the time column out "
+            "(_ in --columns) and give --rate."
+        )
+    return Finding("data.jitter", (), text, apply=apply)
 
 
 def _grid(interval: FloatArray) -> float:
@@ -176,7 +182,7 @@ def in_bursts(interval: FloatArray) -> bool:
     # gaps are few and long; pauses between bursts hold most of the time
     mean = min(mean, np.mean(np.minimum(interval, 20 * mean)))
     together = interval < _SUDDEN * mean
-    pause = interval > 1.5 * mean
+    pause = interval > _PAUSE * mean
     if together.mean() < 0.3 or pause.sum() < 8:
         return False
     return bool(interval[pause].sum() > 0.6 * interval.sum())

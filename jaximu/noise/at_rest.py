@@ -51,13 +51,13 @@ def white_in_rests(segmentation: Segmentation) -> dict[str, FloatArray]:
 
 def unlike_rests(noise: NoiseModel, segmentations: Sequence[Segmentation]) -> Iterator[str]:
     """Say of a noise model that it is not of the sensors whose rests are shown: far noisier, or far too quiet."""
-    seen = [white_in_rests(part) for part in segmentations]
-    for name in seen[0]:
+    shown = [white_in_rests(part) for part in segmentations]
+    for name in shown[0]:
         signals = [part.recording.signals[name] for part in segmentations]
         rounded = max(signal.rounding_variance / signal.rate for signal in signals)
         known = getattr(noise, name)
         density = 0.0 if known is None else float(known.white.mean())
-        ratio = np.sqrt(density / (np.mean([part[name] for part in seen]) + rounded))
+        ratio = np.sqrt(density / (np.mean([part[name] for part in shown]) + rounded))
         if density > 0 and not 1 / _HAND < ratio < _NOISIER:
             yield (
                 f"{name}: the noise that is stated, or shown by the recording at rest, is {ratio:.2g} times what the "

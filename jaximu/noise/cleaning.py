@@ -21,8 +21,8 @@ _SPIKE = 8.0
 FALSE_LINE = 1e-6
 """Probability that noise alone shows a line somewhere on an axis."""
 _MOST_LINES = 20
-_MEANS, _SHORTEST_MEAN = 200, 8
-"""Means over a recording between which a step of the level shows, and samples in each at the least."""
+_MEANS = 200
+"""Means over a recording between which a step of the level shows."""
 _NEAR = 6
 """Means to each side among which a step stands out alone: a warm-up's changes are alike there."""
 _MOST_STEPS = 5
@@ -74,23 +74,23 @@ def without_outliers(values: FloatArray) -> tuple[FloatArray, int]:
 
 
 @dataclass(frozen=True)
-class Step:
+class LevelStep:
     """A step of the level that was taken out: seconds after the first sample, and size (signal unit)."""
 
     time: float
     size: float
 
 
-def without_steps(values: FloatArray, rate: float) -> tuple[FloatArray, tuple[Step, ...]]:
+def without_steps(values: FloatArray, rate: float) -> tuple[FloatArray, tuple[LevelStep, ...]]:
     """Return the samples (n,) less the steps of their level, in the order of time.
 
     Where a step is, means over a two-hundredth of the recording on both sides of one such part differ by more than any
     two others do by chance, drift and walk included, and by more than those nearby.
     """
     size = len(values) // _MEANS
-    level, steps = values, list[Step]()
+    level, steps = values, list[LevelStep]()
     limit = float(normal_isf(FALSE_LINE / (2 * _MEANS)))
-    while size >= _SHORTEST_MEAN:
+    while size >= 10:
         means = _block_means(level, size)
         change = _changes(means, 1)
         at = int(abs(change).argmax())  # the mean before the one in which it steps
@@ -108,7 +108,7 @@ def without_steps(values: FloatArray, rate: float) -> tuple[FloatArray, tuple[St
         span = min(spans, key=lambda span: robust_sigma(spans[span]))  # white noise wants long means, a walk short ones
         step = float(spans[span][at - span + 1])
         level = level - step * (np.arange(len(level)) >= first)
-        steps.append(Step(first / rate, step))
+        steps.append(LevelStep(first / rate, step))
     return level, tuple(sorted(steps, key=lambda step: step.time))
 
 

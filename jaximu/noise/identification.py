@@ -30,8 +30,8 @@ from jaximu.ground.vectors import sigmas_of, submatrix
 from jaximu.model.processes import MEMBER_VARIANCE, TERM_PROCESSES, BiasInstability, FirstOrderGaussMarkov
 from jaximu.noise.cleaning import (
     BRIDGED,
+    LevelStep,
     PeriodicLine,
-    Step,
     fillable,
     filled,
     lowest,
@@ -111,7 +111,7 @@ class Identified:
     lines: tuple[PeriodicLine, ...] = ()
     warm_up: WarmUp | None = None
     outliers: int = 0
-    steps: tuple[Step, ...] = ()
+    steps: tuple[LevelStep, ...] = ()
     high_pass: Term | None = None
     gauss_markov: tuple[GaussMarkov, ...] = ()
 

@@ -206,21 +206,21 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
             f"{recording.name}: {_why_no_poses(results[chosen][0], centres[-1] - centres[0], means[0], notes)}"
         )
     tried = dict(zip(factors, counts, strict=True))
-    torn, remarks = ((), ()) if gyroscope is None else _torn(scan.moments, gyroscope, intervals)
+    torn, remarks = _torn(scan.moments, intervals)
     return Segmentation(recording, intervals, float(factors[chosen]), tried, (*notes, *remarks), torn)
 
 
-def _torn(
-    moments: Sequence[Moments], gyroscope: Signal, intervals: FloatArray
-) -> tuple[tuple[int, ...], tuple[str, ...]]:
+def _torn(moments: Sequence[Moments], intervals: FloatArray) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Which turns' motion is not in the log, and what is said of it: gravity turns by far more than the gyroscope.
 
     Where only some turns are so, samples were lost in them, which is looked for by a fit.
     """
-    force, rate = (running.between(*intervals.T)[0] for running in moments)
-    gravity = _angles(force[:-1], force[1:])
+    force, *rates = (running.between(*intervals.T)[0] for running in moments)
+    if not rates:
+        return (), ()
+    gyroscope, gravity = moments[1].signal, _angles(force[:-1], force[1:])
     shown = np.cumulative_sum(
-        lengths_of(gyroscope.si() - np.median(rate, axis=0)) * np.diff(gyroscope.edges), include_initial=True
+        lengths_of(gyroscope.si() - np.median(rates[0], axis=0)) * np.diff(gyroscope.edges), include_initial=True
     )
     between = gyroscope.time.searchsorted(intervals.ravel()[1:-1].reshape(-1, 2))
     path = np.diff(shown[between])[:, 0]
