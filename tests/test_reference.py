@@ -134,6 +134,11 @@ def test_a_reference_with_a_filter(lag, stages):
     wide, sigma = found.reference["filter"]["variance"], found.reference["filter"]["sigma"]
     assert wide == pytest.approx(made.truth["variance"], rel=0.05) and sigma < 0.05 * wide
     assert "smoothed as by a first-order lag" in " ".join(mounting_words(found))
+    # what a straight line between samples of the gyroscope does is no filter of it
+    interval = 1 / found.data["gyroscope_rate"]
+    for share, words in ((-1 / 6, "No filter of the reference shows"), (-1.0, "The gyroscope is smoothed as by")):
+        seen_so = found.reference | {"filter": {"variance": share * interval**2, "sigma": 1e-3 * interval**2}}
+        assert words in " ".join(mounting_words(replace(found, reference=seen_so)))
 
 
 @pytest.mark.parametrize("delay", [-0.2, 0.005, 1.7])

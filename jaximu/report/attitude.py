@@ -52,7 +52,9 @@ def mounting_words(calibration: Calibration) -> Iterator[str]:
         )
     wide = alignment["filter"]["variance"]
     half = Z95 * alignment["filter"]["sigma"]
-    least, most = (1e3 * root_or_zero(abs(wide) + end) for end in (-half, half))
+    # a straight line between samples smooths as a lag whose square is a sixth of the interval's, and so may samples
+    between = 0.0 if wide > 0 else calibration.data["gyroscope_rate"] ** -2 / 6
+    least, most = (1e3 * root_or_zero(abs(wide) + end) for end in (-half - between, half))
     if least:
         smoothed, beyond = ("reference", "") if wide > 0 else ("gyroscope", " beyond the reference")
         yield f"The {smoothed} is smoothed as by a first-order lag of {least:.3g} to {most:.3g} ms (95 %){beyond}."

@@ -27,7 +27,8 @@ def column_units(table: LogTable, columns: Sequence[Column], option: str, sensor
             first = table.label(used[column.name][0])
             raise table.refused(
                 f"the columns {first} and {table.label(index)} are both {column.name}; "
-                f"ignore one of them: {advise(table).sentence(option)}"
+                "ignore one of them (of two units on one body jaximu array takes both lists, with a ; between): "
+                f"{advise(table).sentence(option)}"
             )
         wanted = QUANTITIES[column.name]
         stated = column.unit or ("1" if wanted == ("ratio",) else None)
