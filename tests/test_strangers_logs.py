@@ -294,6 +294,21 @@ def test_a_check_names_axes_that_are_not_those_of_the_calibration():
         check(calibration, mirrored)
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_check_and_compensate_name_a_log_of_the_opposite_signs(tmp_path, capsys, sign):
+    """Turns look the same in both, and the biases "moved" by twice their size."""
+    calibration, other = calibrate(by_hand(seed=4)), by_hand(seed=6, unit=4)
+    turned = replace(other.accelerometer, values=sign * other.accelerometer.values)
+    validity = check(calibration, replace(other, accelerometer=turned))
+    assert any("all its signs turned round" in note for note in validity.notes) == (sign < 0)
+    calibration.save(tmp_path / "calibration.json")
+    values = columns(other) * [1, sign, sign, sign, 1, 1, 1]
+    path = save(tmp_path / "log.csv", f"time [s],{HEAD}", *lines(values))
+    assert main(["compensate", str(tmp_path / "calibration.json"), str(path), "-o", str(tmp_path / "out.csv")]) == 0
+    printed = capsys.readouterr()
+    assert ("all its signs turned round" in printed.out + printed.err) == (sign < 0)
+
+
 @pytest.mark.parametrize(
     ("order", "words"),
     [

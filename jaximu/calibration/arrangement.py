@@ -13,7 +13,9 @@ import numpy as np
 from jaximu.calibration.calibration import Calibration
 from jaximu.estimation.uncertainty import WeakDirection, gains_open
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import robust_sigma
 from jaximu.ground.quantities import listed
+from jaximu.ground.vectors import lengths_of
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.alignment import angle_of, rotation_of, signed_permutation
 from jaximu.recordings.finding import Finding
@@ -29,6 +31,8 @@ _NEAR = 0.08
 _ODD = 0.2
 """Share by which a scale may differ from the data sheet's."""
 _ALIKE = 3e-3
+_MEANS, _CLEARER = 400, 4.0
+"""Means over a recording in which gravity is looked at, and how much more its size must scatter as it stands."""
 _SLOW = 0.012
 """Difference of all rates alike from which on the sample rate is in doubt."""
 
@@ -77,7 +81,17 @@ def axes_unlike(recording: Recording, imu: Imu) -> str:
     """Say which axes of a recording are not those of a calibrated unit, as gravity turns in it; else nothing.
 
     Outputs f' = M f of an accelerometer make the rates look like det(M) M ω: so the calibration's own axes are undone.
+    Where all signs of f are turned round, turns look the same, and gravity is the same size without the bias alone.
     """
+    force = recording.accelerometer.values
+    means = np.array([part.mean(axis=0) for part in np.array_split(force, min(len(force), _MEANS))])
+    sizes = [lengths_of(imu.accelerometer.recover_on_host(sign * means)) for sign in (1, -1)]
+    kept, turned = (robust_sigma(size - np.median(size)) for size in sizes)
+    if kept > _CLEARER * turned:
+        return (
+            " Against the calibration, the accelerometer has all its signs turned round, as a logger of −f has. Turn "
+            "them round in the log, or calibrate it by itself."
+        )
     motion, gyroscope = recording.turning, recording.gyroscope
     if motion is None or not motion.clear or gyroscope is None or imu.gyroscope is None:
         return ""

@@ -184,6 +184,7 @@ def _compared(
     notes += _temperatures(calibration, old, experiment)
     conditions = experiment.predict(old.imu)[0]
     unlike = axes_unlike(data.recordings[0], old.imu)
+    notes += filter(None, [unlike.strip()])
     _same_unit(experiment, conditions, name, unlike)
 
     scatter = np.ones(len(experiment.real.kinds))
