@@ -231,7 +231,7 @@ def test_which_axis_points_up_is_said_in_words_for_any_axes(tilt, words):
 def test_verbs_by_poses_name_the_filter_where_they_refuse_a_drive(log, tmp_path, capsys, verb):
     _, path = log
     assert main([verb, path, "-o", str(tmp_path)]) == 1
-    assert "a drive with 8 stops: `jaximu filter LOG`" in capsys.readouterr().err
+    assert "in the air, with 8 stops: `jaximu filter LOG`" in capsys.readouterr().err
     with pytest.raises(NotPossibleError, match=r"one orientation throughout[^`]*$"):
         calibrate(simulate(draw_imu(1), Static(60.0), consumer_noise(), seed=1)[0])
 

@@ -247,8 +247,8 @@ def _of_a_vehicle(recording: Recording) -> str:
     with suppress(NotPossibleError):
         if "gyroscope" in recording.signals and (stops := find_stops(recording)):
             return (
-                f" It looks like a drive with {counted(len(stops.intervals), 'stop')}: `jaximu filter LOG` determines "
-                "the gyroscope's bias and the mounting from them."
+                f" It looks like a vehicle, on the ground or in the air, with {counted(len(stops.intervals), 'stop')}: "
+                "`jaximu filter LOG` determines the gyroscope's bias and the mounting from them."
             )
     return ""
 
