@@ -136,6 +136,15 @@ def _of_ready(ready: Sequence[Prepared]) -> NoiseAnalysis:
             continue
         axes[name] = triad
         notes += [*its_notes, *_by_temperature(longest, name), *_taken_out(name, triad)]
+        open_axes = {
+            axis: [letter for letter, term in it.terms.items() if term is not None and term.low == 0]
+            for axis, it in zip("xyz", triad, strict=True)
+        }
+        if doubtful := [f"{axis} ({', '.join(letters)})" for axis, letters in open_axes.items() if letters]:
+            notes.append(
+                f"{name} {', '.join(doubtful)}: other terms describe what is slow there about as well, so that its "
+                "interval begins at zero. Record longer to know which it is."
+            )
         strange = [f"{axis} ({100 * it.excess:.0f} %)" for axis, it in zip("xyz", triad, strict=True) if it.excess]
         if strange:
             notes.append(

@@ -61,7 +61,8 @@ def _mean_term(terms: Sequence[Term | None]) -> MeanTerm | None:
     squares = np.array([(t.low, t.value, min(t.high, 1e20 * t.value)) for t in present.values()]) ** 2  # finite if open
     mean = float(squares[:, 1].sum() / len(terms))
     below, above = (np.sqrt(((squares[:, 1] - squares[:, end]) ** 2).sum()) / len(terms) for end in (0, 2))
-    return MeanTerm(math.sqrt(mean), math.sqrt(max(mean - below, 0.0)), math.sqrt(mean + above), "".join(present))
+    low = math.sqrt(max(mean - below, 0.0)) if squares[:, 0].any() else 0.0  # doubted on all axes for one reason
+    return MeanTerm(math.sqrt(mean), low, math.sqrt(mean + above), "".join(present))
 
 
 @dataclass(frozen=True)

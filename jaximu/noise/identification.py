@@ -54,6 +54,8 @@ _PENALTY = {"N": 4.0, "K": 4.0, "Q": 6.0, "R": 9.0, "B": 9.0}
 are chosen by simulation (benchmarks/noise_terms.py). B and R pay more: over the ten or so coefficients that hold a walk
 it may look like either, −2 log L then scatters more than χ² does, and a walk is the simpler process.
 """
+_TIE = 6.0
+"""What the criterion must be worse by for a combination to be ruled out: it is then twenty times less likely."""
 _UNLIKELY = 1e-3
 """Probability of a misfit below which the terms do not describe the noise."""
 _OVERWHELMING = 40.0
@@ -94,6 +96,8 @@ class GaussMarkov:
 @dataclass(frozen=True)
 class Identified:
     """The terms that one axis's data supports (None: not supported), and the deviation of what they describe.
+
+    The interval of a term begins at zero where others than it describe the data about as well.
 
     misfit: χ² of the fit, octave by octave of frequency, and its degrees of freedom. excess: where χ² is far too large,
     the share by which the spectrum of each octave is let differ from the terms (a correlated process, a filter, a drift
@@ -207,14 +211,15 @@ def _identify(
         # The terms do not describe this noise, and the high frequencies, known best, would dictate all others. Every
         # octave may then differ from the terms by a share that makes the misfit what it should be.
         excess = _excess(general)
-    best = _select(replace(general.model, excess=excess), offered)
+    best, doubtful = _select(replace(general.model, excess=excess), offered)
     result = dict.fromkeys(terms) | {
-        term: _term(best, index, threshold) for index, term in enumerate(best.model.letters)
+        term: _term(best, index, threshold, open_end=term in doubtful) for index, term in enumerate(best.model.letters)
     }
     if best.model.ramp:
         low, high = _ramp_bounds(best, threshold)
         ends = sorted((abs(low), abs(high)))
-        result["R"] = Term(abs(best.ramp), ends[0] if low * high > 0 else 0.0, ends[1])
+        sure = low * high > 0 and "R" not in doubtful
+        result["R"] = Term(abs(best.ramp), ends[0] if sure else 0.0, ends[1])
     first = len(best.model.letters)
     processes = tuple(
         GaussMarkov(_term(best, first + 2 * i, threshold), _term(best, first + 2 * i + 1, threshold, power=1.0))
@@ -616,13 +621,14 @@ def _times(spectrum: _Spectrum, terms: str, count: int) -> tuple[float, ...]:
     return times
 
 
-def _select(general: _Model, terms: str) -> _Fit:
-    """Return the fit of the combination of terms with the least information criterion.
+def _select(general: _Model, terms: str) -> tuple[_Fit, frozenset[str]]:
+    """Return the fit of the combination of terms with the least information criterion, and terms in it that may be
+    others: a combination without one is not ruled out.
 
     Where none is true, there being an excess, the question is which describes best and no longer which is there: the
     criterion is then Akaike's (H. Akaike, IEEE Trans. Autom. Control 19, 1974), two for every term.
     """
-    best, chosen = np.inf, None
+    fits = dict[str, tuple[float, _Fit]]()
     for size in range(0 if general.times else 1, len(terms) + 1):
         for subset in combinations(terms, size):
             if set(subset) == {"R"} and not general.times:
@@ -631,11 +637,12 @@ def _select(general: _Model, terms: str) -> _Fit:
             if (fit.information()[: len(fit.model.letters)] < 0.05).any():
                 continue
             criterion = 2 * fit.loss + sum(2.0 if general.excess else _PENALTY[term] for term in subset)
-            if criterion < best:
-                best, chosen = criterion, fit
-    if chosen is None:
+            fits["".join(subset)] = criterion, fit
+    if not fits:
         raise NotPossibleError("none of the terms asked for describes any of this signal.")
-    return chosen
+    best = min(fits, key=lambda letters: fits[letters][0])
+    near = [set(letters) for letters, (criterion, _) in fits.items() if criterion < fits[best][0] + _TIE]
+    return fits[best][1], frozenset(best).difference(set(best).intersection(*near))
 
 
 def _excess(general: _Fit) -> float:
@@ -691,10 +698,10 @@ def _ends(rise: Callable[[float], float], centre: float, spread: float, threshol
     return end(-1), end(1)
 
 
-def _term(fit: _Fit, index: int, threshold: float, power: float = 0.5) -> Term:
+def _term(fit: _Fit, index: int, threshold: float, power: float = 0.5, open_end: bool = False) -> Term:
     low, high = np.exp(power * np.array(_bounds(fit, index, threshold)))
     value = np.exp(power * fit.theta[index])
-    return Term(float(value), float(low) if low > 1e-3 * value else 0.0, float(high))  # open towards zero
+    return Term(float(value), 0.0 if open_end or low <= 1e-3 * value else float(low), float(high))  # open towards zero
 
 
 def _limit(fit: _Fit, term: str, threshold: float) -> float:
