@@ -348,6 +348,7 @@ def test_both_runs_of_a_measured_sensor_tell_the_same_terms(data_folder):
             if np.log(high.value / low.value) > width:
                 apart.append((name, term))
         assert one.terms["N"] is not None and two.terms["N"] is not None
+        assert not one.steps and not two.steps  # one drifts by a step of its output within half a minute, twice
     assert compared >= 12
     assert len(apart) <= binom.ppf(0.999, compared, 0.05), apart
 

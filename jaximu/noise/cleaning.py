@@ -85,7 +85,7 @@ def without_steps(values: FloatArray, rate: float) -> tuple[FloatArray, tuple[Le
     """Return the samples (n,) less the steps of their level, in the order of time.
 
     Where a step is, means over a two-hundredth of the recording on both sides of one such part differ by more than any
-    two others do by chance, drift and walk included, and by more than those nearby.
+    two others do by chance, drift and walk included, and by more than those nearby, most of it at once.
     """
     size = len(values) // _MEANS
     level, steps = values, list[LevelStep]()
@@ -107,6 +107,9 @@ def without_steps(values: FloatArray, rate: float) -> tuple[FloatArray, tuple[Le
         }
         span = min(spans, key=lambda span: robust_sigma(spans[span]))  # white noise wants long means, a walk short ones
         step = float(spans[span][at - span + 1])
+        sides = level[first - size // 4 : first], level[first : first + size // 4]
+        if (np.nanmean(sides[1]) - np.nanmean(sides[0])) / step < 2 / 3:
+            break  # it takes its time
         level = level - step * (np.arange(len(level)) >= first)
         steps.append(LevelStep(first / rate, step))
     return level, tuple(sorted(steps, key=lambda step: step.time))
