@@ -125,6 +125,22 @@ def test_arrays_of_sensors_with_clocks_of_their_own(recording, tmp_path, more):
     assert any("not used: 'gyro' has" in note for note in found.notes)
 
 
+@pytest.mark.parametrize("name", ["PacketCounter", "seq", "frame_index"])
+@pytest.mark.parametrize("bits", [8, 16, 40])
+def test_a_counter_shows_what_is_missing_where_no_column_is_the_time(recording, tmp_path, name, bits):
+    count = len(recording.accelerometer)
+    kept = np.delete(np.arange(count), np.r_[1000:1003, 2500, 3000:3040])
+    numbers = (kept + 200) % 2**bits
+    path = write(tmp_path / "log.csv", numbers, values_of(recording)[kept], name)
+    found = read_recording(path, options=ReadOptions(rate=100.0, check=False))
+    np.testing.assert_allclose(found.gyroscope.time, kept / 100.0)
+    assert any("by which 44 rows are missing" in note for note in found.notes)
+    whole = read_recording(  # one that leaves nothing out says nothing
+        write(tmp_path / "log.csv", np.arange(count), values_of(recording), name), options=ReadOptions(rate=100.0)
+    )
+    assert not any("are missing" in note for note in whole.notes)
+
+
 def test_stamps_of_another_clock_are_not_those_of_the_samples_beside_them(recording, tmp_path):
     accel, gyro = recording.accelerometer, recording.gyroscope
     names = ["time [s]", *NAMES[:3], "gyroTimestamp [s]", *NAMES[3:]]

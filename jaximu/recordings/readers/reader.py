@@ -24,7 +24,7 @@ from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, Unit, pa
 from jaximu.ground.units import unit as unit_named
 from jaximu.recordings.columns import nominal
 from jaximu.recordings.columns.choose import Used, choose_columns, choose_pair, column_units
-from jaximu.recordings.columns.guess import Advice, advise, without_gravity
+from jaximu.recordings.columns.guess import Advice, advise, counted_rows, without_gravity
 from jaximu.recordings.columns.known import JOINED, known_names, whole_stamps
 from jaximu.recordings.columns.names import (
     CLOCKS,
@@ -814,7 +814,11 @@ def _stamps(table: LogTable, used: Used, options: ReadOptions) -> tuple[FloatArr
             means = " A table with a row of means a pose is for `jaximu calibrate --means`."
             means = means if table.source.rows <= _TABLE else ""
             raise table.refused(f"has no time column; state the sample rate with --rate HZ.{means}")
-        return np.arange(table.source.rows) / rate, Fraction(0), [f"no time column: stamps from {origin}, {rate:g} Hz."]
+        number, said = np.arange(table.source.rows), ""
+        if counter := counted_rows(table):
+            label, number = counter
+            said = f", and {label}, by which {number[-1] + 1 - len(number)} rows are missing"
+        return number / rate, Fraction(0), [f"no time column: stamps from {origin}, {rate:g} Hz{said}."]
     index, unit = used[TIME]
     stamps = table.numbers(index)
     notes = ["--rate not used: the file has a time column."] if options.rate else []
