@@ -66,6 +66,35 @@ def test_a_clock_that_was_set_back_does_not_go_on(recording, tmp_path):
         read_recording(write(tmp_path / "log.csv", time, values_of(recording)))
 
 
+def places(count, off, seed=1):
+    """Rows each of which lies up to so many places from its own."""
+    return np.argsort(np.arange(count) + np.random.default_rng(seed).uniform(0, off + 1, count))
+
+
+@pytest.mark.parametrize("off", [1, 3, 6, 30])
+@pytest.mark.parametrize("name", ["time [s]", "time"])
+def test_rows_that_lie_in_no_order_are_sorted(recording, tmp_path, off, name):
+    """Packets that overtake each other, some of them lost: the sorted stamps are those of one clock."""
+    time, values = recording.accelerometer.time, values_of(recording)
+    kept = np.sort(np.random.default_rng(2).permutation(len(time))[: int(0.97 * len(time))])
+    order = places(len(kept), off)
+    path = write(tmp_path / "log.csv", time[kept][order], values[kept][order], name)
+    advice = advise_reading(path)
+    assert advice.columns in (None, "time [s],accel [m/s^2],gyro [rad/s]") and advice.rate is None
+    found = read_recording(path, options=ReadOptions(columns=advice.columns, check=False))
+    np.testing.assert_allclose(found.accelerometer.time, time[kept] - time[kept[0]], atol=1e-9)
+    np.testing.assert_allclose(values_of(found), values[kept], atol=1e-9)
+    assert any("The rows are out of order" in note for note in found.notes)
+
+
+def test_two_recordings_are_no_rows_in_no_order(recording, tmp_path):
+    """Half a sample apart their sorted stamps are even, and the rows of each are in order."""
+    time, values = recording.accelerometer.time, values_of(recording)
+    both = np.concatenate([time, time + 0.005])
+    with pytest.raises(InputError, match="two recordings in one file"):
+        read_recording(write(tmp_path / "log.csv", both, np.vstack([values, values])))
+
+
 def own_clock(recording):
     """The accelerometer's stamps and values at full rate, and the gyroscope's of every other sample, 3 ms later."""
     accel, gyro = recording.accelerometer, recording.gyroscope

@@ -26,7 +26,17 @@ from jaximu.ground.vectors import column_lengths, lengths_of
 from jaximu.recordings.alignment import CORRELATED, Turning, turning
 from jaximu.recordings.columns.habits import Field, fields_of, last_of, measures, sensor_of, words_of
 from jaximu.recordings.columns.known import EPOCH
-from jaximu.recordings.columns.names import CLOCKS, COUNTS_ADVICE, GROUPS, SINGLE, TIME, Column, header_columns, rises
+from jaximu.recordings.columns.names import (
+    CLOCKS,
+    COUNTS_ADVICE,
+    GROUPS,
+    SINGLE,
+    TIME,
+    Column,
+    header_columns,
+    rises,
+    shuffled,
+)
 from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
 from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.recording import FASTEST, SLOWEST, Signal, likeliest
@@ -336,8 +346,12 @@ class _Guess:
         return "The file has no time column and states no rate."
 
     def _carry_on(self) -> None:
-        """Let the time go on where a counter starts again, whatever its end is."""
-        if self.time is not None and ((steps := np.diff(self._clock)) < 0).any():
+        """Let the time go on where a counter starts again, whatever its end is, and put rows in its order."""
+        if self.time is not None and shuffled(self._clock):
+            order = np.argsort(self._clock, kind="stable")
+            self.table = self.table.take(order)
+            self.numbers = [None if values is None else values[order] for values in self.numbers]
+        elif self.time is not None and ((steps := np.diff(self._clock)) < 0).any():
             steps = np.where(steps < 0, np.median(steps[steps > 0]), steps)
             self.numbers[self.time] = self._clock[0] + np.cumulative_sum(steps, include_initial=True)
 

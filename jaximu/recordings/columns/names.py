@@ -50,6 +50,7 @@ QUANTITIES = dict.fromkeys((TIME, *CLOCKS), ("time",)) | {
     name: group.quantities for group in GROUPS.values() for name in group.columns
 }
 _SAME = 0.01  # of the step, that two clocks of the same samples may differ by
+_NEAR, _EVEN = 64, 0.9  # places that rows may be off their own, and share of sorted steps that are alike
 _SKIPPED = re.compile(r"(?:_|-|skip|)(?:\*(\d{1,4}))?")
 
 
@@ -144,11 +145,24 @@ def _of_one_clock(table: LogTable, columns: Sequence[Column], first: int, second
 
 
 def rises(values: np.ndarray) -> bool:
-    """Whether a column's numbers rise, with repeats and a few steps back, such as a counter's at its end."""
+    """Whether a column's numbers rise, with repeats and a few steps back, such as a counter's at its end.
+
+    Numbers of rows that are `shuffled` rise, too.
+    """
     if values.dtype == object or len(values) < 3:
         return False
     finite = values[np.isfinite(values)]
     steps = np.diff(finite)
     back = steps[steps < 0]
     ended = steps.sum() > 0 or (len(back) and back.max() < -np.ptp(finite) / 2)
-    return bool(len(steps) and (steps > 0).mean() > 0.2 and len(back) < 0.02 * len(steps) and ended)
+    rising = len(steps) and (steps > 0).mean() > 0.2 and ended
+    return bool(rising and (len(back) < 0.02 * len(steps) or shuffled(finite)))
+
+
+def shuffled(values: np.ndarray) -> bool:
+    """Whether numbers go back in places and rise evenly once sorted, each within a few places of its own."""
+    order = np.argsort(values, kind="stable")
+    moved, steps = order - np.arange(len(order)), np.diff(values[order])
+    usual = np.median(steps) if len(steps) else 0.0
+    even = (np.abs(steps - usual) < 0.5 * usual).mean() > _EVEN if usual > 0 else False
+    return bool(moved.any() and np.abs(moved).max() <= _NEAR and even)

@@ -34,6 +34,7 @@ from jaximu.recordings.columns.names import (
     Column,
     header_columns,
     parse_columns,
+    shuffled,
 )
 from jaximu.recordings.columns.table import (
     FEW,
@@ -700,7 +701,9 @@ def _rising(table: LogTable, clock: int, unit: Unit) -> LogTable:
     steps = np.diff(stamps)
     if not (steps <= 0).any() or np.isnan(stamps).any():
         return table
-    back, usual = np.flatnonzero(steps < 0) + 1, np.median(np.abs(steps[steps != 0])) if steps.any() else 0.0
+    back = np.flatnonzero(steps < 0) + 1
+    alone = np.diff(np.sort(stamps)) if shuffled(stamps) else steps  # rows that lie in no order say no step
+    usual = np.median(np.abs(alone[alone != 0])) if alone.any() else 0.0
     if len(back) and (even := _even_clock(stamps)) is not None:
         spread = np.std(stamps - even) * unit.factor
         text = (
