@@ -502,6 +502,41 @@ def test_names_in_other_languages(tmp_path, names, encoding):
     same(read_recording(tmp_path / "log.csv"), values)
 
 
+@pytest.mark.parametrize("last", ["Comment", "Remarks", "Comment,Marker"])
+@pytest.mark.parametrize("sep", [",", ";", "\t"])
+def test_a_column_of_comments_that_stays_empty(tmp_path, last, sep):
+    """Its name is there and its cells are not; any other name too many is not counted off, and said."""
+    values, head = columns(by_hand()), f"time [s],{HEAD}"
+    path = save(tmp_path / "log.csv", f"{head},{last}".replace(",", sep), *lines(values, sep=sep))
+    same(read_recording(path), values)
+    for names in (f"Date,{head}", f"{head},status", head.replace("gx", "temp,gx")):
+        path = save(tmp_path / "other.csv", names.replace(",", sep), *lines(values, sep=sep))
+        with pytest.raises(InputError, match="has 8 names and the rows below it have 7 cells"):
+            read_recording(path)
+
+
+@pytest.mark.parametrize(("sep", "decimal"), [("\t", "."), ("\t", ","), (",", "."), (";", "."), (";", ",")])
+def test_lines_of_keys_with_numbers_above_the_names(tmp_path, sep, decimal):
+    """As LabVIEW writes them: one line gives the units, and lines below the names may be a summary."""
+    values = columns(by_hand())
+    keys = (("Samples", *[str(len(values))] * 6), ("Date", *["2024/03/01"] * 6),
+            ("Y_Unit_Label", *["m/s^2"] * 3, *["rad/s"] * 3), ("X0", *["0.00E+0"] * 6),
+            ("Delta_X", *["0.020000"] * 6))  # fmt: skip
+    head = [
+        "***End_of_Header***" + 7 * sep,
+        sep.join([*"X_Value,Acc X,Acc Y,Acc Z,Gyr X,Gyr Y,Gyr Z".split(","), "Comment"]),
+    ]
+    rows = lines(values, sep=sep)
+    above = [f"LabVIEW Measurement{sep}", f"Writer_Version{sep}2", "", f"Channels{sep}6{6 * sep}", *map(sep.join, keys)]
+    path = save(tmp_path / "log.lvm", *(row.replace(".", decimal) for row in (*above, *head, *rows)))
+    advice = advise_reading(path)
+    assert advice.columns in (None, "time [s],accel [m/s^2],gyro [rad/s]") and not advice.questions
+    same(read_recording(path, options=ReadOptions(columns=advice.columns)), values)
+    summary = sep.join(["max", *["9.9"] * 6])
+    path = save(tmp_path / "more.csv", f"time [s],{HEAD}".replace(",", sep), summary, *lines(values, sep=sep))
+    same(read_recording(path), values)
+
+
 def test_angles_are_no_rates(tmp_path):
     """A sensor's own angles have the shape of a gyroscope's output, and its sign changes."""
     values = columns(by_hand())

@@ -41,6 +41,7 @@ class _Layout:
     first: int  # index of the first line of data
     decimal: str = "."
     rate: float | None = None  # Hz, where the lines before the data state it
+    remarks: tuple[str, ...] = ()
 
 
 def read(path: Path, source: Source) -> LogTable:
@@ -62,11 +63,12 @@ def read(path: Path, source: Source) -> LogTable:
         layout = replace(layout, decimal=".,".replace(grouping, ""))
         whole = _ungrouped(_lines(path.read_bytes() if whole is None else whole), layout, grouping.encode())
     rows: np.ndarray | int = layout.first + 1
-    remarks: tuple[str, ...] = ()
+    remarks = layout.remarks
     parsed = _read_straight(path, layout) if whole is None and layout.delimiter != " " else None
     if parsed is None:
         data = _lines(path.read_bytes() if whole is None else whole)
-        table, rows, remarks = _read_cleaned(data, layout, source.path)
+        table, rows, more = _read_cleaned(data, layout, source.path)
+        remarks += more
         parsed = [from_arrow(column) for column in table.columns], table.schema
     columns, schema = parsed
     names = [  # a column of dates states its own unit
@@ -240,9 +242,15 @@ def _is_number(cell: str, decimal: str = ".") -> bool:
     return True
 
 
+def _is_word(cell: str, decimal: str) -> bool:
+    return bool(cell.strip()) and not _is_number(cell, decimal)
+
+
 _ENCODINGS = ("latin-1", "gb18030", "shift_jis", "cp1251")
 _MARKS = ("#", "//", "%")
 """Signs that a line is a remark, or the header behind such a sign."""
+_TEXTS = set("comment comments remark remarks note notes marker markers annotation annotations kommentar".split())
+"""Words of the names of columns that may be missing behind the last cell."""
 _RULE = re.compile(r"[-=_+|\s]*")
 """A line that only separates others, or an empty one."""
 _STYLES = [(delimiter, decimal) for decimal, order in ((".", "\t,; |"), (",", ";\t, |")) for delimiter in order]
@@ -279,20 +287,29 @@ def _layout(data: bytes, path: str) -> _Layout:
         raise InputError(f"{path}: holds {only}.")
     _, delimiter, decimal, width = best
     rows = [_cells(line, delimiter) for _, line in filled]
-    trailing = all(not cells[-1].strip() for cells in rows if len(cells) == width and any(map(_is_number, cells)))
+    holding = [cells for cells in rows if len(cells) == width and any(_is_number(cell, decimal) for cell in cells)]
+    trailing = all(not cells[-1].strip() for cells in holding)
+    worded = 2 * sum(_is_word(cells[0], decimal) for cells in holding) > len(holding)
     headers: list[list[str]] = []
+    remarks: tuple[str, ...] = ()
     for (at, _), cells in zip(filled, rows, strict=True):
         numbers = sum(_is_number(cell, decimal) for cell in cells)
         if not numbers and (len(cells) == width - 1 and trailing):
             cells = [*cells, ""]  # data ends in a delimiter that the header has not, or the other way round
-        elif not numbers and len(cells) == width + 1 and not cells[-1].strip():
-            cells = cells[:-1]
+        elif (
+            not numbers and len(cells) > width and delimiter != " " and set(words_of(" ".join(cells[width:]))) <= _TEXTS
+        ):
+            cells = cells[:width]
+        elif not numbers and len(cells) > width and sum(bool(field.canonical) for field in fields_of(cells)) > 2:
+            remarks = (f"row {at + 1} has {len(cells)} names and the rows below it have {width} cells: not used.",)
+        if numbers and _is_word(cells[0], decimal) and not worded:
+            continue  # a key with its values, above the names or below them
         if len(cells) != width and not headers and not 1 < numbers == len(cells):
             continue  # preamble; but a short row of numbers, or any after the header, is data that parsing will refuse
         if numbers or (headers and len(cells) != width):
             rate = stated_rate("\n".join(lines[:at]))
             names = _named(headers) or _commented_header(lines[:at], delimiter, width)
-            return _Layout(delimiter, names, width, at, decimal, rate)
+            return _Layout(delimiter, names, width, at, decimal, rate, () if names else remarks)
         headers.append(cells)
     raise AssertionError("a width is that of some line of numbers")
 
