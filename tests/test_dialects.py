@@ -96,6 +96,43 @@ def test_a_temperature_without_a_unit_is_said_to_be_a_guess(tmp_path):
     assert any("'temp' states no unit" in reason for reason in advice.reasons)
 
 
+@pytest.mark.parametrize(
+    ("name", "written"),
+    [
+        *((name, lambda celsius: 32 + 1.8 * celsius)
+          for name in ("temp_f", "TemperatureF", "Temp degF", "temp_fahrenheit", "Temp [°F]")),
+        *((name, lambda celsius: celsius + 273.15) for name in ("temp_K", "Temp kelvin")),
+        *((name, lambda celsius: 100 * celsius) for name in ("temp_c_x100", "Temp [0.01 degC]")),
+        *((name, lambda celsius: 1000 * celsius) for name in ("Temp_mC", "temp [mC]", "temp [m°C]")),
+        ("temp_c_x10", lambda celsius: 10 * celsius),
+        ("temp_c", lambda celsius: celsius),
+    ],
+)  # fmt: skip
+def test_the_unit_of_a_temperature_in_its_name(tmp_path, name, written):
+    log = simulate("poses")
+    celsius = np.linspace(20.0, 30.0, len(log.time))
+    names = ["time [s]", *xyz("acc_{} [g]"), name]
+    recording = read_recording(text(tmp_path, names, [log.time, log.force / G, written(celsius)]), options=AS_IS)
+    np.testing.assert_allclose(recording.temperature.values[:, 0], celsius, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("celsius", "factor", "offset", "unit"),
+    [(20.0, 1.0, 273.15, "K"), (-40.0, 1.0, 273.15, "K"), (20.0, 1.8, 32.0, "degC"), (55.0, 1.0, 0.0, "degC"),
+     (15.0, 1.0, 0.0, "degC"), (20.0, 10.0, 0.0, "count")],
+)  # fmt: skip
+def test_a_temperature_without_a_unit_by_its_numbers(tmp_path, celsius, factor, offset, unit):
+    """Those that suit °C and °F are asked about; whole numbers of 200 and more may be tenths."""
+    log = simulate("poses")
+    heat = factor * (celsius + np.linspace(0, 10, len(log.time))) + offset
+    heat = np.round(heat) if unit == "count" else heat
+    path = text(tmp_path, ["t", *xyz("acc_{} [g]"), "temp"], [log.time, log.force / G, heat])
+    advice = advise_reading(path)
+    assert advice.columns == f"time [s],accel [g],temperature [{unit}]"
+    asked_about = any("write degF in its place if not" in question.text for question in advice.questions)
+    assert asked_about is (unit == "degC" and celsius != 15.0)
+
+
 @pytest.mark.parametrize("order", [[0, 1, 2], [1, 0, 2], [1, 2, 0], [2, 1, 0]])
 def test_where_columns_stand_proves_nothing(tmp_path, order):
     """Time, forces and rates in any order, without names: the values say which is which."""

@@ -82,7 +82,12 @@ _FACTORS = {
         "h hour hours": 3600.0,
         "d day days": 86400.0,
     },
-    "temperature": {"degC °C C celsius ℃": 1.0, "K kelvin": 1.0, "degF °F F fahrenheit": 5.0 / 9.0},
+    "temperature": {
+        "degC °C C celsius ℃": 1.0,
+        "K kelvin": 1.0,
+        "degF °F F fahrenheit": 5.0 / 9.0,
+        "mdegC m°C mC": 1e-3,
+    },
     "magnetic field": {
         "uT µT μT": 1.0,
         "T tesla": 1e6,

@@ -72,6 +72,10 @@ _TURNING = 5.0  # times the scatter in them by which means of a gyroscope at res
 _ANOTHER = math.log(2.0)  # logarithm by which a level at rest must miss 1 g for its unit to be another
 _COPY = 0.99  # share of an accelerometer's variance that its own values in another unit explain
 _HOTTEST = 125.0  # °C that a sensor survives
+_KELVIN, _EITHER = (
+    (200.0, 400.0),
+    (32.0, 60.0),
+)  # numbers in K; from above the one to above the other: °C or °F
 _TURN = "turn gravity as the accelerometer shows"
 
 
@@ -814,22 +818,27 @@ class _Guess:
                 continue
             unit = _fitting(field.unit, name)
             if unit is None and "temperature" in name:
-                unit = self._temperature_unit(self.table.label(at), values[np.isfinite(values)])
+                unit = self._temperature_unit(self.table.label(at), field.unit, values[np.isfinite(values)])
             if unit:
                 self.chosen[at] = Column(name, unit)
 
-    def _temperature_unit(self, label: str, values: FloatArray) -> str | None:
-        """°C, or a chip's counts: whole numbers beside sensors in counts, or what no sensor survives."""
-        low, high = values.min(), values.max()
-        counts = any(column.unit == "count" for column in self.chosen.values()) and (values == values.round()).all()
+    def _temperature_unit(self, label: str, unit: str | None, values: FloatArray) -> str | None:
+        """°C, which may be asked, or K, or a chip's counts: whole numbers beside such sensors, or too many."""
+        low, high, whole = values.min(), values.max(), (values == values.round()).all()
+        between = f"{label} is between {low:.6g} and {high:.6g}"
+        counts = whole and any(column.unit == "count" for column in self.chosen.values())
+        if _KELVIN[0] < low <= high < _KELVIN[1] and not (whole or unit):  # whole ones may be tenths of °C
+            self.reasons.append(f"{between} and states no unit: K")
+            return "K"
         if -60 < low <= high < _HOTTEST and not counts:
+            if _EITHER[0] < low and high > _EITHER[1]:
+                self._ask(f"Is {label} in °C? It is between {low:.4g} and {high:.4g}; write degF in its place if not.")
             self.reasons.append(f"{label} states no unit and is taken to be in °C")
             return "degC"
         if low == high:
             return None
         self.reasons.append(
-            f"{label} is between {low:.6g} and {high:.6g}, which is no temperature in °C but a chip's counts: "
-            f"{COUNTS_ADVICE}, for jaximu thermal"
+            f"{between}, which is no temperature in °C but a chip's counts: {COUNTS_ADVICE}, for jaximu thermal"
         )
         return "count"
 

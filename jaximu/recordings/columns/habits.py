@@ -87,7 +87,14 @@ _UNIT_NAMES = {
         "mdeg/s": "mdps, mdeg s",
     },
     "mag": {"uT": "ut, u t, µ t, µt", "G": "gauss, g", "mG": "mgauss, mg, m g", "nT": "nt, n t"},
-    "temperature": {"degC": "c, degc, celsius, deg c", "K": "k", "degF": "f"},
+    "temperature": {
+        "degC": "c, degc, celsius, deg c",
+        "K": "k, kelvin",
+        "degF": "f, degf, fahrenheit, deg f",
+        "0.1 degC": "c x 10, cx 10",
+        "0.01 degC": "c x 100, cx 100",
+        "mdegC": "m c, mc, mdegc, mdeg c",
+    },
 }
 _UNIT_WORDS = {
     sensor: {words: unit for unit, names in units.items() for words in names.split(", ")}
@@ -183,7 +190,7 @@ class Field:
         words, times = [word for word in words_of(text) if word != "axis"], _UNIT_WORDS["time"]
         stem, axis = _axis(words)
         sensor, why_not = sensor_of(stem)
-        if sensor is None and why_not is None:
+        if sensor in (None, "temperature") and why_not is None:  # the F of degrees names an accelerometer elsewhere
             for size in (3, 2, 1):  # a unit at the end of the name, whose axis stands before it
                 head, tail = words[:-size], " ".join(words[-size:])
                 if _time(head) and tail in times:
