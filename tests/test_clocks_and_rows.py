@@ -66,6 +66,77 @@ def test_a_clock_that_was_set_back_does_not_go_on(recording, tmp_path):
         read_recording(write(tmp_path / "log.csv", time, values_of(recording)))
 
 
+def clock_times(seconds, day="", digits=2):
+    """Texts of seconds of a day."""
+    whole = np.round(np.asarray(seconds) % 86400 * 10**digits).astype(np.int64)
+    parts = [whole // 10**digits // each % (60 if each < 3600 else 24) for each in (3600, 60, 1)]
+    return [f"{day}{h:02d}:{m:02d}:{s:02d}.{rest:0{digits}d}" for h, m, s, rest in zip(*parts, whole % 10**digits,
+                                                                                    strict=True)]  # fmt: skip
+
+
+SET_BACK = {
+    "summer time ends": (3600, 2.999),
+    "by half an hour": (1800, 1.999),
+    "twelve hours": (43200, 12.999),
+    "a zone is set": (5.5 * 3600, 12.3),
+}
+
+
+@pytest.mark.parametrize("kind", SET_BACK)
+@pytest.mark.parametrize("day", ["2024-10-27 ", "27.10.2024 ", ""])
+def test_a_time_of_day_that_is_set_back_goes_on(recording, tmp_path, kind, day):
+    back, start = SET_BACK[kind]
+    time = recording.accelerometer.time
+    stamps = np.where(time > 20.0, -back, 0.0) + time + start * 3600
+    found = read_recording(write(tmp_path / "log.csv", clock_times(stamps, day), values_of(recording), "time"))
+    np.testing.assert_allclose(found.gyroscope.time, time - time[0], atol=1e-6)
+    assert any(f"is set back by {back:.10g} s in 1 place" in note for note in found.notes)
+    assert not {"data.order", "data.gap", "data.time_scale"} & {finding.name for finding in inspect(found)}
+
+
+def test_a_time_of_day_that_is_set_back_by_anything_else_does_not_go_on(recording, tmp_path):
+    time = recording.accelerometer.time
+    stamps = np.where(time > 30.0, -31.4, 0.0) + time + 40000
+    with pytest.raises(InputError, match="two recordings in one file"):
+        read_recording(write(tmp_path / "log.csv", clock_times(stamps), values_of(recording), "time"))
+
+
+@pytest.mark.parametrize("start", [12.999, 23.998, 9.51])
+@pytest.mark.parametrize("name", ["utc_time", "time", "time [s]"])
+def test_hours_minutes_and_seconds_as_one_number(recording, tmp_path, start, name):
+    """As NMEA has them: 125959.98 is followed by 130000.00, and 235959.99 by 000000.00."""
+    time = recording.accelerometer.time
+    stamps = [text.replace(":", "") for text in clock_times(time + start * 3600)]
+    path = write(tmp_path / "log.csv", stamps, values_of(recording), name)
+    for stated in (None, "time [s],accel [m/s^2],gyro [rad/s]"):
+        found = read_recording(path, options=ReadOptions(columns=stated))
+        np.testing.assert_allclose(found.gyroscope.time, time - time[0], atol=1e-6)
+        assert any("are hours, minutes and seconds" in note for note in found.notes)
+
+
+def test_hours_minutes_and_seconds_with_what_is_left_of_them(recording, tmp_path):
+    time = recording.accelerometer.time
+    stamps, rest = zip(*(text.replace(":", "").split(".") for text in clock_times(time + 46780, digits=3)), strict=True)
+    path = write(tmp_path / "log.csv", stamps, values_of(recording), "UTC", {"ms": rest})
+    np.testing.assert_allclose(read_recording(path).gyroscope.time, time - time[0], atol=1e-6)
+
+
+def test_seconds_are_no_time_of_day(recording, tmp_path):
+    time = recording.accelerometer.time
+    for begun_at in (0.0, 30.0, 1200.0, 99990.0):
+        found = read_recording(write(tmp_path / "log.csv", time + begun_at, values_of(recording)))
+        np.testing.assert_allclose(found.gyroscope.time, time - time[0], atol=1e-6)
+
+
+def test_a_pause_is_no_wrong_unit(recording, tmp_path):
+    time = recording.accelerometer.time.copy()
+    time[len(time) // 2 :] += 1e5
+    names = {
+        finding.name for finding in inspect(read_recording(write(tmp_path / "log.csv", time, values_of(recording))))
+    }
+    assert "data.gap" in names and "data.time_scale" not in names
+
+
 def places(count, off, seed=1):
     """Rows each of which lies up to so many places from its own."""
     return np.argsort(np.arange(count) + np.random.default_rng(seed).uniform(0, off + 1, count))

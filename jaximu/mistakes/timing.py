@@ -63,12 +63,13 @@ def _timing(name: str, sensor: Sensor, alike: Sequence[Sensor]) -> Iterator[Find
             apply=steady_clock,
         )
         return
-    if not _SLOWEST <= 1 / mean <= FASTEST:
+    usual = 1 / sensor.period  # a pause lowers the mean
+    if not _SLOWEST <= usual <= FASTEST:
         yield Finding(
             "data.time_scale",
             (),
-            f"{name}: {len(sensor)} samples in {sensor.time[-1] - sensor.time[0]:.4g} s are {1 / mean:.3g} a "
-            "second: the unit of the time column is wrong. Change it in the header or with --columns.",
+            f"{name}: samples {sensor.period:.4g} s apart are {usual:.3g} a second: the unit of the time column is "
+            "wrong. Change it in the header or with --columns.",
             spoils=True,
         )
     if len(stretches := stretches_of_one_rate(sensor.time)) > 1:

@@ -87,6 +87,8 @@ JOINED = "whole time [ns]"
 """Name of a column of stamps that was joined from two."""
 _LATEST = 2**33  # s
 _PARTS = {"ms": 10**3, "us": 10**6, "ns": 10**9}
+_CARRY = 10.0  # usual steps, that one to the next minute may be at the most
+_DAY = 86400 * 10**9  # ns
 _GAPS = 0.1  # of the seconds may begin with a row whose rest does not fall, as after a gap
 
 
@@ -196,9 +198,16 @@ def whole_stamps(table: LogTable) -> LogTable:
     """The table with its stamps as one column where they are whole seconds in one and the rest of them in another.
 
     They belong together by their names (sec and nanosec), or because the one falls just where the other rises. The
-    column of the seconds holds both then, in nanoseconds and called `JOINED`; the other stays.
+    column of the seconds holds both then, in nanoseconds and called `JOINED`; the other stays. So does one whose digits
+    are those of a time of day.
     """
     fields = fields_of(table.header)
+    for at, field in enumerate(fields):
+        in_seconds = field.sensor == "time" and field.unit in (None, "s")
+        if in_seconds and (stamps := _of_digits(table.columns[at])) is not None:
+            names = [*table.header[:at], JOINED, *table.header[at + 1 :]]
+            note = f"the digits of {table.label(at)} are hours, minutes and seconds."
+            table = replace(table.with_column(at, stamps), names=names).noted(note)
     for rest, title in enumerate(table.header):
         prefix, unit = last_of(title)
         parts = _PARTS.get(fields[rest].unit or unit or "")
@@ -217,6 +226,20 @@ def whole_stamps(table: LogTable) -> LogTable:
             joined = table.with_column(at, written * 10**9 + table.columns[rest] * (10**9 // parts))
             return replace(joined, names=names).noted(f"time is {table.label(at)} and {table.label(rest)}.")
     return table
+
+
+def _of_digits(values: np.ndarray) -> np.ndarray | None:
+    """Nanoseconds of a day of numbers such as 125959.98, which 130000.00 follows; None for any others."""
+    if values.dtype.kind not in "fi" or not ((values >= 0) & (values < 240000)).all():
+        return None
+    whole = np.floor(values).astype(np.int64)
+    minutes, seconds = whole // 100 % 100, whole % 100
+    stamps = (whole // 10000 * 60 + minutes) * 60 * 10**9 + np.round((values - whole + seconds) * 1e9).astype(np.int64)
+    steps = np.diff(stamps) % _DAY
+    if max(minutes.max(initial=0), seconds.max(initial=0)) >= 60 or not (steps > 0).any():
+        return None
+    carried = steps[np.diff(whole // 100) != 0]
+    return stamps if len(carried) and np.median(carried) < _CARRY * np.median(steps[steps > 0]) else None
 
 
 def _between(values: np.ndarray, end: int) -> bool:

@@ -67,10 +67,13 @@ _TABLE = 200  # rows, up to which a file without time may be a table of pose mea
 _SET_BACK = 1.0  # s: more than this is a clock that was set, not disorder
 _JITTER = 2.0  # sample periods that stamps may be off a steady clock for their rows to be in order
 _UNEVEN = 0.1  # of the period, that sorted stamps scatter by where they jitter
+_SETTINGS = {1800.0 * count for count in range(1, 24 + 1)}
+"""Seconds by which a clock of the day is set back: as summer time ends, as a zone is set, or without AM and PM."""
 _ENDS = sorted({2.0**bits * unit for bits in (16, 24, 32) for unit in (1e-9, 1e-6, 1e-3)} | {86400.0, 604800.0})
 """Seconds after which clocks start again: counters of 16, 24 and 32 bits, a day, a week of GPS."""
 _COUNTED, _FEW_COUNTED = 64.0, 4.0  # samples that a counter tells apart, and at the least
 _EVENLY = 0.8, 1.25  # sample intervals across the end of a counter of few samples
+_SET = 3.0  # sample intervals between the last stamp before a clock was set back and the first after
 _CARRIED = 10.0  # sample intervals between the last stamp before a clock started again and the first after
 _HALVED = 0.6  # of the usual step, and less: two rows where one is due
 _FEW_SHARED, _FEW_SHARES = 10, 0.02  # rows, and share of them, from which on repeated stamps are a habit
@@ -629,18 +632,23 @@ def _stamped(table: LogTable, clock: int, unit: Unit) -> LogTable:
 
 
 def _carried_on(table: LogTable, clock: int, unit: Unit) -> LogTable:
-    """The rows with a time that goes on where a counter passed its end, or a day or a week of GPS began, and a note."""
+    """The rows with a time that goes on where a counter passed its end, or a day or a week of GPS began, and a note.
+
+    So does a time of day, which is held in whole numbers, where its clock was set back.
+    """
     stamps = table.numbers(clock)
     steps = np.diff(stamps)
     if not (steps < 0).any() or not (steps > 0).any():  # NaN is neither
         return table
     usual = np.median(steps[steps > 0])
-    for seconds in _ENDS:
+    of_day = stamps.dtype.kind == "i" and unit.factor in (1e-9, 1.0)
+    for seconds in sorted(_SETTINGS.union(_ENDS)) if of_day else _ENDS:
         span = seconds / unit.factor
         if span < _FEW_COUNTED * usual:
             continue
         # one that ends after a few samples must go on as evenly as they come
         nearest, farthest = (0.0, _CARRIED) if span > _COUNTED * usual else _EVENLY
+        farthest = min(farthest, _SET) if seconds in _SETTINGS else farthest
         full = stamps.dtype.type(round(span) if stamps.dtype.kind == "i" else span)
         back = np.flatnonzero(steps < -full / 2)
         after = (steps[back] + full) / usual
@@ -649,7 +657,8 @@ def _carried_on(table: LogTable, clock: int, unit: Unit) -> LogTable:
         turns = np.zeros(len(stamps), stamps.dtype)
         turns[back + 1] = full
         places = f"{counted(len(back), 'place')} (row {table.row(back[0] + 1)})"
-        note = f"the clock starts again after {seconds:.10g} s in {places}: its time goes on from there."
+        happened = "is set back by" if seconds in _SETTINGS else "starts again after"
+        note = f"the clock {happened} {seconds:.10g} s in {places}: its time goes on from there."
         return table.with_column(clock, stamps + turns.cumsum()).noted(note)
     return table
 
