@@ -537,6 +537,51 @@ def test_lines_of_keys_with_numbers_above_the_names(tmp_path, sep, decimal):
     same(read_recording(path), values)
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        "axb [m/s^2],ayb [m/s^2],azb [m/s^2],p [rad/s],q [rad/s],r [rad/s]",
+        "ax_b [m/s^2],ay_b [m/s^2],az_b [m/s^2],p_b [rad/s],q_b [rad/s],r_b [rad/s]",
+        "accxraw [m/s^2],accyraw [m/s^2],acczraw [m/s^2],p_imu [rad/s],q_imu [rad/s],r_imu [rad/s]",
+        "NxOut [m/s^2],NyOut [m/s^2],NzOut [m/s^2],p_filt [rad/s],q_filt [rad/s],r_filt [rad/s]",
+    ],
+)
+def test_letters_of_axes_within_names(tmp_path, names):
+    values = columns(by_hand())
+    path = save(tmp_path / "log.csv", f"time [s],{names}", *lines(values))
+    advice = advise_reading(path)
+    assert not advice.questions and advice.columns in (None, "time [s],accel [m/s^2],gyro [rad/s]")
+    same(read_recording(path, options=ReadOptions(columns=advice.columns)), values)
+
+
+@pytest.mark.parametrize(
+    ("order", "names"),
+    [
+        ((1, 2, 3), "Longitudinal,Lateral,Vertical"),
+        ((2, 1, 3), "Lateral,Longitudinal,Vertical"),
+        ((1, 2, 3), "forward,left,up"),
+        ((1, 2, 3), "one,two,three"),
+    ],
+)
+def test_the_only_columns_in_a_unit_of_acceleration_are_asked_about(tmp_path, order, names):
+    """Which way they point is for the person to say: neither is there no accelerometer, nor is one assumed."""
+    values = columns(by_hand())
+    force = ",".join(f"{name} acceleration (m/s^2)" for name in names.split(","))
+    rows = lines(values[:, [0, *order, 4, 5, 6]])
+    path = save(tmp_path / "log.csv", f"time [s],{force},Roll rate (rad/s),Pitch rate (rad/s),Yaw rate (rad/s)", *rows)
+    with pytest.raises(InputError, match=r"Are .* the accelerometer along x, y and z"):
+        read_recording(path)
+    advice = advise_reading(path)
+    assert advice.accelerometer and "[?]" in advice.columns
+    same(read_recording(path, options=ReadOptions(columns=advice.columns.replace("?", "m/s^2"))), values)
+
+
+def test_set_points_are_no_rates(tmp_path):
+    values = columns(by_hand())
+    names = "time [s],ax [m/s^2],ay [m/s^2],az [m/s^2],p_cmd [rad/s],q_cmd [rad/s],r_cmd [rad/s]"
+    assert read_recording(save(tmp_path / "log.csv", names, *lines(values))).gyroscope is None
+
+
 def test_angles_are_no_rates(tmp_path):
     """A sensor's own angles have the shape of a gyroscope's output, and its sign changes."""
     values = columns(by_hand())

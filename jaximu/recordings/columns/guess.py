@@ -76,6 +76,12 @@ _KELVIN, _EITHER = (
     (200.0, 400.0),
     (32.0, 60.0),
 )  # numbers in K; from above the one to above the other: °C or °F
+_DIRECTIONS = {
+    "x": "longitudinal long forward fore front surge",
+    "y": "lateral lat left right sway transverse sideways",
+    "z": "vertical vert up down heave",
+}
+"""Words for the axes of a vehicle."""
 _TURN = "turn gravity as the accelerometer shows"
 
 
@@ -514,12 +520,37 @@ class _Guess:
         if candidates:
             shown = " or ".join(f"{triad.label} (norm {triad.level:.4g})" for triad in candidates[:4])
             self._ask(f"Which columns are the accelerometer? {shown} could be, or could be a magnetometer.")
+        elif by_unit := self._by_unit():
+            return by_unit
         else:
             self._ask(
                 "Which columns are the accelerometer? None are named so, and no three others hold 1 g while the unit "
                 "rests."
             )
         return None
+
+    def _by_unit(self) -> _Triad | None:
+        """The only three columns in a unit of acceleration, whose names say no axes, or say them in words."""
+        places = [
+            at
+            for at, field, _ in self._looked_at()
+            if find_unit(field.unit, "acceleration") and not (field.sensor or field.why_not)
+        ]
+        units = {self.fields[at].unit for at in places}
+        triad = self._triad(places, unit="?") if len(places) == len("xyz") and len(units) == 1 else None
+        if triad is None:
+            return None
+        words = {word: axis for axis, names in _DIRECTIONS.items() for word in names.split()}
+        said = [{words[word] for word in self.fields[at].stem if word in words} for at in places]
+        if sorted("".join(axes) for axes in said) == [*"xyz"]:
+            triad = self._triad([places[said.index({axis})] for axis in "xyz"], unit="?") or triad
+        shown = ", ".join(self.table.label(at) for at in triad.places)
+        self._ask(
+            f"Are {shown} the accelerometer along x, y and z? They alone are in {units.pop()}. Write the unit if they "
+            "are; where one points the other way, to the right or down beside x forward, state --axes.",
+            "accel [?]",
+        )
+        return triad
 
     def _by_turning(self, free: list[_Triad], accel: _Triad) -> _Triad | None:
         """The triad whose rates turn gravity as the accelerometer says."""

@@ -54,7 +54,7 @@ _REFUSALS = {
     "an error": "error err",
     "a quaternion": "quat q quaternion",
     "angles": "euler angle angles winkel",
-    "a set point": "setpoint",
+    "a set point": "setpoint sp cmd command commanded desired des target ref reference",
 }
 _REFUSED = {word: reason for reason, words in _REFUSALS.items() for word in words.split()}
 """Words beside a sensor's by which a column is not its measurement, and what it is."""
@@ -222,33 +222,41 @@ class Field:
 def fields_of(names: Sequence[str]) -> list[Field]:
     """The fields of a table's names, without what most of them begin with (a device's name and number).
 
-    Axes that are counted (acc[0], acc[1], acc[2]) or called p, q, r have letters.
+    Axes that are counted (acc[0], acc[1], acc[2]) or called p, q, r have letters, as have names that differ in them.
     """
     fields = [Field.of(name) for name in _without_prefix(names)]
-    lettered: dict[str, dict[str, int]] = {}
-    for at, field in enumerate(fields):
-        if field.axis is None and field.sensor is None and field.stem and field.stem[-1][-1] in "xyz":
-            lettered.setdefault(" ".join(field.stem)[:-1], {})[field.stem[-1][-1]] = at
-    joined = {" ".join(field.stem) for field in fields}
-    for head, places in lettered.items():
-        if head and len(places) == 3:
-            stem = tuple(head.split())
+    lettered: dict[tuple[str, str], dict[str, int]] = {}
+    joined = [" ".join(field.stem) for field in fields]
+    for at, (field, text) in enumerate(zip(fields, joined, strict=True)):
+        for place, letter in enumerate(text if field.axis is None and field.sensor is None else ""):
+            if place and letter in "xyz":
+                lettered.setdefault((text[:place], text[place + 1 :]), {})[letter] = at
+    for (head, tail), places in lettered.items():
+        if len(places) == 3:
+            stem = (*head.split(), *tail.split())
             sensor, why_not = sensor_of(stem)
-            why_not = "a quaternion" if f"{head}w" in joined else why_not
+            why_not = "a quaternion" if f"{head}w{tail}" in joined else why_not
             for axis, at in places.items():
                 fields[at] = replace(fields[at], stem=stem, axis=axis, sensor=sensor, why_not=why_not)
     counted: dict[tuple[str, ...], dict[str, int]] = {}
     for at, field in enumerate(fields):
         if field.axis and field.axis.isdigit() and field.sensor:
             counted.setdefault(field.stem, {})[field.axis] = at
-        elif len(field.stem) == 1 and field.stem[0] in "pqr":
-            counted.setdefault(("p", "q", "r"), {})[str("pqr".index(field.stem[0]))] = at
+        elif field.stem and field.stem[0] in tuple("pqr") and _of_rates(field):
+            counted.setdefault(("p", "q", "r", *field.stem[1:]), {})[str("pqr".index(field.stem[0]))] = at
     for places in counted.values():
         if sorted(places) in (["0", "1", "2"], ["1", "2", "3"]):
             for axis, (_, at) in zip("xyz", sorted(places.items()), strict=True):
                 stem = fields[at].stem if fields[at].sensor else ("p", "q", "r")
                 fields[at] = replace(fields[at], stem=stem, axis=axis, sensor=fields[at].sensor or "gyro", why_not=None)
     return fields
+
+
+def _of_rates(field: Field) -> bool:
+    """Whether what follows p, q or r lets it be a rate: nothing, or words that say the body's, or a rate's unit."""
+    rest = set(field.stem[1:])
+    plain = field.axis is None and not rest & _REFUSED.keys()
+    return not rest or (plain and (rest <= _NEUTRAL | {"b"} or measures(field.unit) == "gyro"))
 
 
 def _without_prefix(names: Sequence[str]) -> list[str]:
