@@ -249,6 +249,23 @@ def test_stamps_of_another_clock_are_not_those_of_the_samples_beside_them(record
     np.testing.assert_allclose(found.gyroscope.time, accel.time, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["I", "instance", "imu_id", "index"])
+def test_a_column_that_counts_units(recording, tmp_path, capsys, name):
+    """As an autopilot has it; the lines that info proposes choose the unit, and a counter of rows is no unit's."""
+    time, values = recording.accelerometer.time, values_of(recording)
+    both = np.stack([values, values * 1.02 + 0.01], axis=1).reshape(-1, 6)
+    path = write(tmp_path / "log.csv", np.repeat(time, 2), both, extra={name: np.tile([3, 4], len(time))})
+    assert main(["info", str(path)]) != 0
+    assert f"by column '{name}': choose one of them, 3, 4" in capsys.readouterr().err
+    names = ",".join(column.partition(" ")[0] for column in path.read_text().splitlines()[0].split(","))
+    path.write_text("\n".join([names, *path.read_text().splitlines()[1:]]) + "\n")
+    assert main(["info", str(path), "--device", "4"]) == 0
+    proposed = [line for line in capsys.readouterr().out.splitlines() if "jaximu calibrate" in line]
+    assert proposed and all("--device 4" in line for line in proposed)
+    counted = write(tmp_path / "counted.csv", time, values, extra={"index": np.arange(len(time)) % 10})
+    assert len(read_recording(counted).accelerometer) == len(time)
+
+
 @pytest.mark.parametrize("ids", [("0", "1"), ("left", "right")])
 @pytest.mark.parametrize("late", [0.0, 0.001, 0.005])
 def test_units_that_write_in_turn_are_not_mixed(recording, tmp_path, ids, late):
@@ -373,6 +390,30 @@ def test_seconds_and_what_is_left_of_them_are_one_time(recording, tmp_path, seco
     read = read_recording(path, options=ReadOptions(columns=columns))
     np.testing.assert_allclose(read.gyroscope.time, time - time[0], atol=1.1 / per_second)
     assert any(f"time is '{seconds}" in note and f"and '{rest}" in note for note in read.notes)
+    assert not any("not used" in note for note in read.notes)
+
+
+@pytest.mark.parametrize(("name", "per_second"), [("dt [ms]", 1e3), ("delta_us", 1e6), ("deltaT [s]", 1.0),
+                                                  ("sample interval (ms)", 1e3), ("delta_usec", 1e6)])  # fmt: skip
+def test_intervals_since_the_row_before_are_summed(recording, tmp_path, name, per_second):
+    time, values = recording.accelerometer.time, values_of(recording)
+    kept = np.delete(np.arange(len(time)), np.arange(700, 720))
+    late = time[kept] + np.random.default_rng(0).uniform(0, 1e-3, len(kept))
+    steps = np.round(np.diff(late, prepend=late[0] - 0.01) * per_second, 9)
+    path = write(tmp_path / "log.csv", steps, values[kept], name)
+    for columns in (None, f"time [{'us' if per_second == 1e6 else 'ms'}],accel [m/s^2],gyro [rad/s]"):
+        read = read_recording(path, options=ReadOptions(columns=columns))
+        np.testing.assert_allclose(read.gyroscope.time, late - late[0], atol=1e-5)
+        assert any("the time is their sum" in note for note in read.notes)
+    read = read_recording(write(path, steps, values[kept], name, {"stamp [s]": late}))  # beside stamps it is nothing
+    np.testing.assert_allclose(read.gyroscope.time, late - late[0], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["delta", "dt", "delta_x [ms]"])
+def test_other_differences_are_no_intervals(recording, tmp_path, name):
+    steps = np.full(len(recording.accelerometer), 0.01)
+    with pytest.raises(InputError, match="no time column"):
+        read_recording(write(tmp_path / "log.csv", steps, values_of(recording), name))
 
 
 def test_milliseconds_alone_are_the_time_and_of_a_second_they_are_none(recording, tmp_path):

@@ -12,6 +12,7 @@ from jaximu.noise.analysis import analyse_noise
 from jaximu.recordings.entry import ScheduleEntry
 from jaximu.recordings.readers import ReadOptions, advise_reading, read_magnetometer, read_recording
 from jaximu.recordings.recording import Recording, Signal
+from jaximu.report.thermal import _share
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld
 
@@ -397,3 +398,16 @@ def test_stops_in_one_orientation_are_no_poses(tmp_path, capsys):
     main(["info", str(written(tmp_path / "log.csv", ["time [s]", *BOTH], t, a, g))])
     said = " ".join(capsys.readouterr().out.split())
     assert "poses are of one orientation" in said and "jaximu calibrate" not in said and "and the turns" not in said
+
+
+def test_two_poses_of_one_orientation_are_both(tmp_path, capsys):
+    random, t = np.random.default_rng(7), np.arange(0, 60, 0.02)
+    moving = ((t > 20) & (t < 35))[:, None]
+    a = [0.1, 0.0, G] + 0.02 * random.normal(size=(len(t), 3)) + 3 * moving * np.sin(2 * t)[:, None] * [1.0, 0.2, 0.0]
+    g = 0.002 * random.normal(size=(len(t), 3)) + 0.4 * moving * np.sin(0.9 * t)[:, None] * [1.0, 1.0, 1.0]
+    main(["info", str(written(tmp_path / "log.csv", ["time [s]", *BOTH], t, a, g))])
+    assert "Both poses are of one orientation" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_whole_share_is_a_hundred_percent():
+    assert [_share(share) for share in (1.0, 0.996, 0.034)] == ["100 %", "100 %", "3.4 %"]

@@ -614,6 +614,22 @@ def test_what_is_no_row_costs_itself(tmp_path, where, line, gone):
         assert any("left out" in note or "no whole sample" in note for note in recording.notes)
 
 
+@pytest.mark.parametrize(
+    "end", ["End of recording\nTotal,{}\n", "Mean,1,2,3\nMax,4,5,6\n", "{:.2f},0.1,-", "{:.2f},0.1"]
+)
+def test_what_follows_the_last_row_costs_itself(tmp_path, end):
+    """A summary, and a row that is cut off where the file ends; between rows, and with its end, it is refused."""
+    values = columns(by_hand())
+    text = "\n".join([f"time [s],{HEAD}", *lines(values), end.format(len(values))])
+    (tmp_path / "log.csv").write_text(text)
+    recording = read_recording(tmp_path / "log.csv")
+    same(recording, values)
+    assert any("left out" in note for note in recording.notes)
+    (tmp_path / "log.csv").write_text(f"{text.rstrip()}\n{lines(values[-1:])[0]}\n")
+    with pytest.raises(InputError, match="cells where the others hold 7"):
+        read_recording(tmp_path / "log.csv")
+
+
 @pytest.mark.parametrize("late", [0.1, 0.3, 0.5, 0.6, 0.9])
 def test_two_runs_are_not_sorted_into_each_other(tmp_path, late):
     """Whatever part of a step the second run is late by."""

@@ -13,7 +13,7 @@ from jaximu.calibration.calibration import Calibration, require_calibration
 from jaximu.estimation.track import TEMPERATURE_WINDOW, TRIADS
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
-from jaximu.ground.quantities import listed
+from jaximu.ground.quantities import listed, number
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model.sensor import Imu, Triad
 from jaximu.model.stimulus import Stimulus
@@ -109,6 +109,6 @@ def _extrapolated(calibration: Calibration, recording: Recording) -> list[str]:
         return []
     spanned = f"{signal.values.min():.1f} to {signal.values.max():.1f} °C"
     return [
-        f"extrapolated: {100 * share:.2g} % of the temperatures ({spanned}) lie outside the {low:.1f} to {high:.1f} °C "
-        "that were calibrated"
+        f"extrapolated: {number(100 * share, 2)} % of the temperatures ({spanned}) lie outside the {low:.1f} to "
+        f"{high:.1f} °C that were calibrated"
     ]

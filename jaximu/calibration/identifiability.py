@@ -12,7 +12,7 @@ from jaximu.calibration.thermal_terms import HISTORY, LEARNED, POWERS, RATES, SC
 from jaximu.data.rest_blocks import Leg, RestBlocks
 from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.quantities import listed
+from jaximu.ground.quantities import listed, number
 from jaximu.ground.vectors import column_lengths
 
 _TOLD = 0.05
@@ -105,10 +105,10 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
     hidden = [name for name in (*RATES, *HISTORY) if name not in observable]
     if len(hidden) == len(parts):
         words.append(
-            f"Over this path the rate of temperature, a lag and a hysteresis are functions of temperature, to "
-            f"{max(100 * share, 0.1):.2g} %: this recording cannot separate them, nor the warm-up after power-on, from "
-            "bias over temperature. The fit is their sum, and holds for this way and rate of change only. Record a "
-            "cycle: the same range up and down, then again at another rate."
+            "Over this path the rate of temperature, a lag and a hysteresis are functions of temperature, to "
+            f"{number(max(100 * share, 0.1), 2)} %: this recording cannot separate them, nor the warm-up after "
+            "power-on, from bias over temperature. The fit is their sum, and holds for this way and rate of change "
+            "only. Record a cycle: the same range up and down, then again at another rate."
         )
     elif hidden or alike:
         separate = [_WORDS[name] for name in (*RATES, *HISTORY) if name not in hidden and name not in alike]
@@ -117,8 +117,8 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
             lacking = listed([_WORDS[name] for name in hidden], "or")
             sentences.append(f"It cannot separate {lacking} from plain temperature dependence.")
         if alike:
-            share = 100 * (1 - min(parts[name].apart for name in alike))
-            sentences.append(f"The other effects imitate {listed([_WORDS[name] for name in alike])} to {share:.2g} %.")
+            share = number(100 * (1 - min(parts[name].apart for name in alike)), 2)
+            sentences.append(f"The other effects imitate {listed([_WORDS[name] for name in alike])} to {share} %.")
         sentences += ["Record a cycle, then again at another rate, to separate them."] if hidden else []
         words.append(" ".join(sentences))
     else:

@@ -85,8 +85,9 @@ class InfoCommand:
         from jaximu.report.terminal import show
 
         for path, (document, uses), reading in zip(self.logs, described, stated, strict=True):
-            guess = document.get("guess")
-            line = f" {guess['line']}" if guess else options.typed(reading)
+            guess = f" {document['guess']['line']}" if "guess" in document else ""
+            again = {name: None for name in ("accel_scale", "gyro_scale") if f"--{name.replace('_', '-')} " in guess}
+            line = guess + options.typed(replace(reading, **again))
             show(log_page(document, [use.line(path, line) for use in uses]))
 
 
@@ -104,7 +105,7 @@ def read_openly(log: options.LogOptions, path: Path) -> tuple[Recording, Advice 
     except JaximuError:
         from jaximu.recordings.readers import advise_reading
 
-        advice = advise_reading(path, log.rate) if log.columns is None and log.gyro_log is None else None
+        advice = advise_reading(path, log.rate, log.device) if log.columns is None and log.gyro_log is None else None
         if advice is not None and not advice.readable:
             raise InputError(f"{path}: {advice.sentence()}{_shown(advice)}") from None
         columns = log.columns or (advice.columns if advice else None)
@@ -151,7 +152,7 @@ def in_other_units(log: options.LogOptions, path: Path) -> tuple[options.LogOpti
     try:
         log.read(path, alone=True)
     except JaximuError as error:
-        advice = advise_reading(path, log.rate)
+        advice = advise_reading(path, log.rate, log.device)
         if advice is None or not advice.readable or "?" in advice.line():
             return None
         scales = {name: getattr(advice, name) or getattr(log, name) for name in ("accel_scale", "gyro_scale")}
@@ -356,8 +357,8 @@ def _poses(recording: Recording, findings: list[str]) -> int:
     tilt = _tilt(force)
     if poses > 1 and tilt < _TILTED:
         findings.append(
-            f"all {poses} poses are of one orientation, within {tilt:.2g}°: a calibration by poses needs nine or more, "
-            "all around"
+            f"{'both' if poses == 2 else f'all {poses}'} poses are of one orientation, within {tilt:.2g}°: a "
+            "calibration by poses needs nine or more, all around"
         )
         return 0
     return poses

@@ -192,7 +192,7 @@ def _advised(path: Path, log: options.LogOptions) -> tuple[Advice | None, Json]:
     if log.columns is not None:
         blanks = {"rate": "time" not in log.columns, "gyro_scale": "gyro [count]" in log.columns}
         return None, values | {name: "?" for name, blank in blanks.items() if blank and values[name] is None}
-    advice = advise_reading(path, log.rate)
+    advice = advise_reading(path, log.rate, log.device)
     guesses = [(advice, "columns")]
     if log.gyro_log is not None and log.gyro_columns is None:
         guesses.append((advise_reading(log.gyro_log, log.rate), "gyro_columns"))
@@ -246,7 +246,7 @@ def _without_inertial(path: Path, log: options.LogOptions) -> _Content | None:
     from jaximu.report.recording import signal_facts
 
     try:
-        if log.columns is None and (advice := advise_reading(path)):
+        if log.columns is None and (advice := advise_reading(path, device=log.device)):
             log = replace(log, columns=advice.magnetometer)
         signal, _, _ = read_magnetometer(path, log.reading())
     except JaximuError:

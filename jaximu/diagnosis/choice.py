@@ -17,7 +17,7 @@ from jaximu.diagnosis.experiment import State
 from jaximu.diagnosis.selection import causes_of, criterion
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import normal_sf
-from jaximu.ground.quantities import Z95
+from jaximu.ground.quantities import Z95, number
 
 _NEGLIGIBLE = 1e-4
 """Weight, relative to the likeliest model's, below which a model is left out."""
@@ -41,8 +41,8 @@ def with_open_choice(calibration: Calibration, base: State, effects: Sequence[st
         for triad in calibration.bias_sigma_recording
     }
     note = (
-        f"The uncertainties of gain and bias are up to {100 * (max(wider, default=1.0) - 1):.2g} % larger than the "
-        "fit's: they allow for other effects that this recording does not exclude."
+        f"The uncertainties of gain and bias are up to {number(100 * (max(wider, default=1.0) - 1), 2)} % larger than "
+        "the fit's: they allow for other effects that this recording does not exclude."
     )
     return replace(
         calibration,

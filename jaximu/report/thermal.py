@@ -304,7 +304,7 @@ def _ways(thermal: ThermalCalibration) -> list[Part]:
 
 
 def _share(share: float) -> str:
-    return f"{100 * share:.2g} %" if share > _LEAST_SHARE else f"< {100 * _LEAST_SHARE:g} %"
+    return f"{number(100 * share, 2)} %" if share > _LEAST_SHARE else f"< {100 * _LEAST_SHARE:g} %"
 
 
 def _ambient(thermal: ThermalCalibration) -> Iterator[Statement]:

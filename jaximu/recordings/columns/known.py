@@ -10,7 +10,8 @@ from pathlib import PurePath
 import numpy as np
 
 from jaximu.ground.units import column_title, find_unit, parse_column
-from jaximu.recordings.columns.habits import fields_of, last_of
+from jaximu.recordings.columns.habits import fields_of, last_of, words_of
+from jaximu.recordings.columns.names import rises
 from jaximu.recordings.columns.table import LogTable
 
 
@@ -85,6 +86,10 @@ _Named = tuple[Sequence[str], str]
 """Names in our words, and a note of whose they are."""
 JOINED = "whole time [ns]"
 """Name of a column of stamps that was joined from two."""
+REST = "joined"
+"""Name of the column that was joined to it."""
+_INTERVALS = set("dt delta deltat interval".split())
+"""Words of the names of columns that hold the time since the row before."""
 _LATEST = 2**33  # s
 _PARTS = {"ms": 10**3, "us": 10**6, "ns": 10**9}
 _CARRY = 10.0  # usual steps, that one to the next minute may be at the most
@@ -199,10 +204,15 @@ def whole_stamps(table: LogTable) -> LogTable:
 
     They belong together by their names (sec and nanosec), or because the one falls just where the other rises. The
     column of the seconds holds both then, in nanoseconds and called `JOINED`; the other stays. So does one whose digits
-    are those of a time of day.
+    are those of a time of day, and one of intervals where there is no other time.
     """
     fields = fields_of(table.header)
+    timed = any(field.sensor == "time" for field in fields)
     for at, field in enumerate(fields):
+        if not timed and (stamps := _summed(table, at)) is not None:
+            names = [*table.header[:at], JOINED, *table.header[at + 1 :]]
+            note = f"{table.label(at)} is the interval since the row before: the time is their sum."
+            return replace(table.with_column(at, stamps), names=names).noted(note)
         in_seconds = field.sensor == "time" and field.unit in (None, "s")
         if in_seconds and (stamps := _of_digits(table.columns[at])) is not None:
             names = [*table.header[:at], JOINED, *table.header[at + 1 :]]
@@ -222,10 +232,21 @@ def whole_stamps(table: LogTable) -> LogTable:
             ):
                 continue
             names = [*table.header]
-            names[at] = JOINED
+            names[at], names[rest] = JOINED, REST
             joined = table.with_column(at, written * 10**9 + table.columns[rest] * (10**9 // parts))
             return replace(joined, names=names).noted(f"time is {table.label(at)} and {table.label(rest)}.")
     return table
+
+
+def _summed(table: LogTable, at: int) -> np.ndarray | None:
+    """Nanoseconds of a column of intervals, by its name and unit; None for any other."""
+    title, stated = parse_column(table.header[at])
+    head, last = last_of(title)
+    unit, words, values = find_unit(stated or last, "time"), set(words_of(head)), table.columns[at]
+    named = words & _INTERVALS and words <= _INTERVALS | {"t", "time", "sample", "sampling"}
+    if unit is None or not named or values.dtype.kind not in "fi" or not (values >= 0).all() or rises(values):
+        return None
+    return np.round(np.cumsum(values * unit.factor) * 1e9).astype(np.int64)
 
 
 def _of_digits(values: np.ndarray) -> np.ndarray | None:

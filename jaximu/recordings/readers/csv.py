@@ -207,7 +207,7 @@ def _read_cleaned(data: bytes, layout: _Layout, path: str) -> tuple[pa.Table, np
     body, rows, notes = _body(data, layout)
     with suppress(pa.ArrowInvalid):
         return _parse(body, layout, min(len(body) + 1, _SINGLE_BLOCK)), rows, notes
-    body, rows, remarks = _without_remarks(body, layout, rows, path)
+    body, rows, remarks = _without_remarks(body, layout, rows, path, not data.endswith(b"\n"))
     try:
         return _parse(body, layout, min(len(body) + 1, _SINGLE_BLOCK)), rows, notes + remarks
     except pa.ArrowInvalid as error:
@@ -380,20 +380,23 @@ def _parse(data: bytes, layout: _Layout, block: int) -> pa.Table:
 
 
 def _without_remarks(
-    body: bytes, layout: _Layout, rows: np.ndarray, path: str
+    body: bytes, layout: _Layout, rows: np.ndarray, path: str, cut_off: bool
 ) -> tuple[bytes, np.ndarray, tuple[str, ...]]:
     """The lines that have as many cells as the rest and their numbers, without remarks.
 
-    Raises InputError for a row of numbers with another number of cells.
+    What follows the last whole row may hold numbers behind a word, and be a row that is `cut_off` where the file ends.
+    Raises InputError for any other row of numbers with another number of cells.
     """
     lines = body.rstrip(b"\n").split(b"\n")
-    kept, notes = [], []
-    for at, line in enumerate(lines):
-        cells = _cells(_text(line), layout.delimiter)
-        if len(cells) == layout.width:
-            kept.append(at)
-        elif not any(_is_number(cell, layout.decimal) for cell in cells):
+    whole = np.array([len(_cells(_text(line), layout.delimiter)) == layout.width for line in lines])
+    kept, notes = np.flatnonzero(whole), []
+    for at in np.flatnonzero(~whole):
+        line, cells = lines[at], _cells(_text(lines[at]), layout.delimiter)
+        footer = at > kept.max(initial=-1) and _is_word(cells[0], layout.decimal)
+        if footer or not any(_is_number(cell, layout.decimal) for cell in cells):
             notes.append(f"row {rows[at]} is a remark and left out: {_text(line)[:_QUOTED]!r}.")
+        elif cut_off and at == len(lines) - 1 and len(cells) < layout.width:
+            notes.append(f"row {rows[at]}, with which the file ends, is cut off and left out.")
         else:
             last = "; it is the last one: the file is cut off, delete that row" if at == len(lines) - 1 else ""
             raise InputError(

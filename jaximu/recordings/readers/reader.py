@@ -25,7 +25,7 @@ from jaximu.ground.units import unit as unit_named
 from jaximu.recordings.columns import nominal
 from jaximu.recordings.columns.choose import Used, choose_columns, choose_pair, column_units
 from jaximu.recordings.columns.guess import Advice, advise, counted_rows, without_gravity
-from jaximu.recordings.columns.known import JOINED, known_names, whole_stamps
+from jaximu.recordings.columns.known import JOINED, REST, known_names, whole_stamps
 from jaximu.recordings.columns.names import (
     CLOCKS,
     COUNTS_ADVICE,
@@ -523,12 +523,13 @@ def _tables_of_file(file: Path, name: str, options: ReadOptions) -> tuple[LogTab
     return tuple(_checked(table.without_markers(), source) for table in whole)
 
 
-def advise_reading(path: FilePath, rate: float | None = None) -> Advice | None:
+def advise_reading(path: FilePath, rate: float | None = None, device: str | None = None) -> Advice | None:
     """How to read a table whose header does not say it all; None for a log that names its columns itself.
 
-    `rate`: Hz, where it is known. Raises InputError as `read_tables` does.
+    `rate`: Hz, where it is known. `device`: whose rows, where several units write in turn. Raises InputError as
+    `read_tables` does, and where the unit is to be chosen.
     """
-    table = read_tables(path)[0]
+    table = _read(path, ReadOptions(device=device))[0]
     table = replace(table, rate=rate or table.rate)
     return None if table.messages else advise(whole_stamps(table))
 
@@ -607,7 +608,8 @@ def extract(
         if dropped:
             notes.append(f"{group.field}: {dropped} of {len(stamps)} rows hold no whole sample of it.")
         signals[key], units[group.field] = signal, places[0][1].name
-    unused = [table.label(index) for index, column in enumerate(columns) if column.name is None]
+    left = [index for index, column in enumerate(columns) if column.name is None]
+    unused = [table.label(index) for index in left if table.header[index] != REST]
     if unused and table.names and options.columns is None and not table.messages:
         notes.append(f"columns not used: {', '.join(unused)}.")
     return _FilePart(table.source, signals, origin, tuple(notes), units)

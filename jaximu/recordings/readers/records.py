@@ -166,7 +166,9 @@ def apart(table: LogTable) -> LogTable:
     return table
 
 
-_DEVICE = set("id ids device devices dev sensor unit imu node serial sn mac address addr source".split())
+_COUNTED = {"i", "index"}
+"""Names of columns that say which unit a row is of, or count something else: the rows show it."""
+_DEVICE = set("id ids device devices dev sensor unit imu node serial sn mac address addr source instance".split())
 """Words of the names of columns that say which unit a row is of."""
 _FEWEST, _MOST_DEVICES, _IN_TURN = 0.02, 64, 0.02
 """Share of the rows that a unit has at the least, number of units, and share of rows after which another one writes."""
@@ -182,7 +184,7 @@ def of_device(table: LogTable, device: str | None, usual: str | None = None) -> 
     triads = {field.sensor for field in fields if field.axis} & SENSORS.keys()
     for at, field in enumerate(fields if triads else ()):
         words = set(words_of(table.header[at]))
-        if field.canonical or not words or not words <= _DEVICE or (field.axis and field.sensor):
+        if field.canonical or not words or not words <= _DEVICE | _COUNTED or (field.axis and field.sensor):
             continue
         names = np.array(list(map(str, table.columns[at].tolist())))
         units, counts = np.unique(names, return_counts=True)
@@ -190,6 +192,8 @@ def of_device(table: LogTable, device: str | None, usual: str | None = None) -> 
         if not 1 < len(units) <= _MOST_DEVICES or counts.min() < _FEWEST * len(names) or in_turn < _IN_TURN:
             continue
         if not _alike(table, [names == unit for unit in units]):  # rows of several sensors of one unit
+            continue
+        if words <= _COUNTED and _units_in_turn(table) != len(units):
             continue
         device = usual if device is None and usual in units else device
         if device is None:
