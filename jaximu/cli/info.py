@@ -86,8 +86,8 @@ class InfoCommand:
 
         for path, (document, uses), reading in zip(self.logs, described, stated, strict=True):
             guess = f" {document['guess']['line']}" if "guess" in document else ""
-            again = {name: None for name in ("accel_scale", "gyro_scale") if f"--{name.replace('_', '-')} " in guess}
-            line = guess + options.typed(replace(reading, **again))
+            guessed = {name: None for name in ("accel_scale", "gyro_scale") if f"--{name.replace('_', '-')} " in guess}
+            line = guess + options.typed(replace(reading, **guessed))
             show(log_page(document, [use.line(path, line) for use in uses]))
 
 

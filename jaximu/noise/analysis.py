@@ -269,7 +269,7 @@ def _taken_out(name: str, axes: Sequence[Identified]) -> list[str]:
             steps = listed([f"{size(step.size, unit, 2)} after {step.time:.4g} s" for step in it.steps])
             notes.append(
                 f"{name} {axis}: its level steps by {steps}, and stays there: taken out, for a step is no random walk. "
-                "A knock, a switch of supply or range, or the unit that settles may be behind it."
+                "A knock, a switch of supply or range, or a unit that was put down may be behind it."
             )
         if it.high_pass is not None:
             time = it.high_pass

@@ -62,7 +62,7 @@ def unlike_rests(noise: NoiseModel, segmentations: Sequence[Segmentation]) -> It
             yield (
                 f"{name}: the noise that is stated, or shown by the recording at rest, is {ratio:.2g} times what the "
                 "rests of this log show: a wrong unit of its columns, another device, or a table that shook. The "
-                "uncertainties follow it; leave it out, or mend it."
+                "uncertainties follow it; leave it out, or correct it."
             )
 
 

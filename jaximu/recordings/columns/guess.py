@@ -541,9 +541,9 @@ class _Guess:
         if triad is None:
             return None
         words = {word: axis for axis, names in _DIRECTIONS.items() for word in names.split()}
-        said = [{words[word] for word in self.fields[at].stem if word in words} for at in places]
-        if sorted("".join(axes) for axes in said) == [*"xyz"]:
-            triad = self._triad([places[said.index({axis})] for axis in "xyz"], unit="?") or triad
+        axes_of = [{words[word] for word in self.fields[at].stem if word in words} for at in places]
+        if sorted("".join(axes) for axes in axes_of) == [*"xyz"]:
+            triad = self._triad([places[axes_of.index({axis})] for axis in "xyz"], unit="?") or triad
         shown = ", ".join(self.table.label(at) for at in triad.places)
         self._ask(
             f"Are {shown} the accelerometer along x, y and z? They alone are in {units.pop()}. Write the unit if they "

@@ -228,9 +228,9 @@ def fields_of(names: Sequence[str]) -> list[Field]:
     lettered: dict[tuple[str, str], dict[str, int]] = {}
     joined = [" ".join(field.stem) for field in fields]
     for at, (field, text) in enumerate(zip(fields, joined, strict=True)):
-        for place, letter in enumerate(text if field.axis is None and field.sensor is None else ""):
-            if place and letter in "xyz":
-                lettered.setdefault((text[:place], text[place + 1 :]), {})[letter] = at
+        for index, letter in enumerate(text if field.axis is None and field.sensor is None else ""):
+            if index and letter in "xyz":
+                lettered.setdefault((text[:index], text[index + 1 :]), {})[letter] = at
     for (head, tail), places in lettered.items():
         if len(places) == 3:
             stem = (*head.split(), *tail.split())

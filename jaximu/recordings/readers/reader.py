@@ -828,11 +828,11 @@ def _stamps(table: LogTable, used: Used, options: ReadOptions) -> tuple[FloatArr
             means = " A table with a row of means a pose is for `jaximu calibrate --means`."
             means = means if table.source.rows <= _TABLE else ""
             raise table.refused(f"has no time column; state the sample rate with --rate HZ.{means}")
-        number, said = np.arange(table.source.rows), ""
+        number, by = np.arange(table.source.rows), ""
         if counter := counted_rows(table):
             label, number = counter
-            said = f", and {label}, by which {number[-1] + 1 - len(number)} rows are missing"
-        return number / rate, Fraction(0), [f"no time column: stamps from {origin}, {rate:g} Hz{said}."]
+            by = f", and {label}, by which {number[-1] + 1 - len(number)} rows are missing"
+        return number / rate, Fraction(0), [f"no time column: stamps from {origin}, {rate:g} Hz{by}."]
     index, unit = used[TIME]
     stamps = table.numbers(index)
     notes = ["--rate not used: the file has a time column."] if options.rate else []
