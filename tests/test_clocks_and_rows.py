@@ -239,6 +239,10 @@ def test_a_counter_shows_what_is_missing_where_no_column_is_the_time(recording, 
         write(tmp_path / "log.csv", np.arange(count), values_of(recording), name), options=ReadOptions(rate=100.0)
     )
     assert not any("are missing" in note for note in whole.notes)
+    sections = np.roll(np.arange(count), count // 3)  # put together in another order
+    path = write(tmp_path / "log.csv", sections, values_of(recording), name)
+    found = read_recording(path, options=ReadOptions(rate=100.0, check=False))
+    np.testing.assert_allclose(found.gyroscope.time, np.arange(count) / 100.0)
 
 
 def test_stamps_of_another_clock_are_not_those_of_the_samples_beside_them(recording, tmp_path):
