@@ -235,6 +235,7 @@ def test_a_counter_shows_what_is_missing_where_no_column_is_the_time(recording, 
     found = read_recording(path, options=ReadOptions(rate=100.0, check=False))
     np.testing.assert_allclose(found.gyroscope.time, kept / 100.0)
     assert any("by which 44 rows are missing" in note for note in found.notes)
+    assert not any("not used" in note for note in found.notes)
     whole = read_recording(  # one that leaves nothing out says nothing
         write(tmp_path / "log.csv", np.arange(count), values_of(recording), name), options=ReadOptions(rate=100.0)
     )

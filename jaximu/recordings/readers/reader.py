@@ -610,6 +610,7 @@ def extract(
         signals[key], units[group.field] = signal, places[0][1].name
     left = [index for index, column in enumerate(columns) if column.name is None]
     unused = [table.label(index) for index in left if table.header[index] != REST]
+    unused = [label for label in unused if not any(label in note for note in notes)]  # a counter's that shows the time
     if unused and table.names and options.columns is None and not table.messages:
         notes.append(f"columns not used: {', '.join(unused)}.")
     return _FilePart(table.source, signals, origin, tuple(notes), units)
