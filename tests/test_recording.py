@@ -135,7 +135,7 @@ def test_wrong_accelerometer_unit(factor, advice):
         (57.29578, "like deg/s"),
         (1 / 57.29578, "like rad/s, stated as deg/s"),
         (57295.78, "like mdeg/s"),
-        (6.0, "check the unit"),
+        (6.0, "no unit makes this factor"),
     ],
 )
 def test_wrong_gyroscope_unit_is_seen_in_slow_motion(factor, advice):

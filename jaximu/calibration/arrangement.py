@@ -84,6 +84,8 @@ def axes_unlike(recording: Recording, imu: Imu) -> str:
     Where all signs of f are turned round, turns look the same, and gravity is the same size without the bias alone.
     """
     force = recording.accelerometer.values
+    if not len(force):
+        return ""
     means = np.array([part.mean(axis=0) for part in np.array_split(force, min(len(force), _MEANS))])
     sizes = [lengths_of(imu.accelerometer.recover_on_host(sign * means)) for sign in (1, -1)]
     kept, turned = (robust_sigma(size - np.median(size)) for size in sizes)

@@ -84,7 +84,7 @@ def _interval(entry: Mapping[str, Any], sign: bool = False) -> str:
 
 def _mounting(vehicle: Mapping[str, Any]) -> str:
     slope = vehicle["slope"]
-    known = "" if slope is None else f" The ground at the stops slopes by {size(slope, 'rad', 2)} (rms), included here."
+    known = "" if slope is None else f" The ground there sloped by {size(slope, 'rad', 2)} (rms), which is in it."
     roll = vehicle["roll"]["value"]
     pitch = vehicle["pitch"]["value"]
     up = np.array([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])  # in the unit
