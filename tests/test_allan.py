@@ -244,7 +244,7 @@ def test_the_grid_of_uneven_stamps():
     time = 3.0 + np.arange(1000) / 99.7 + 1e-4 * rng.standard_normal(1000)
     keep = np.sort(rng.choice(1000, 950, replace=False))
     keep = np.unique(np.concatenate([[0], keep, [999]]))
-    values, rate = evenly_sampled(Signal(time[keep], np.arange(1000.0)[keep, None] * np.ones(3), "rad/s"))
+    values, rate, *_ = evenly_sampled(Signal(time[keep], np.arange(1000.0)[keep, None] * np.ones(3), "rad/s"))
     assert rate == pytest.approx(99.7, rel=1e-4) and values.shape == (3, 1000)
     np.testing.assert_array_equal(values[0][keep], keep)
     assert np.isnan(values[0]).sum() == 1000 - len(keep)

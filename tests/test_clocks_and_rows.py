@@ -1,6 +1,7 @@
 """What a log's stamps and rows say: counters that pass their end, units that write in turn, single bad values."""
 
 import re
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ from jaximu.calibration import calibrate
 from jaximu.cli import main
 from jaximu.ground.errors import InputError
 from jaximu.mistakes import inspect
+from jaximu.noise.analysis import evenly_sampled
 from jaximu.recordings.readers import ReadOptions, advise_reading, read_recording
+from jaximu.recordings.segmentation import segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld
 
@@ -56,6 +59,33 @@ def test_a_clock_that_begins_anew_goes_on(recording, tmp_path, kind):
     )
     assert any("its time goes on from there" in note for note in found.notes)
     assert not {"data.order", "data.gap"} & {finding.name for finding in inspect(found)}
+
+
+@pytest.mark.parametrize("name", ["time [s]", "time [us]"])
+def test_a_clock_that_was_set_forward_by_years_goes_on(recording, tmp_path, name):
+    """A clock that nobody set begins in 1970, until a receiver of GPS or the network sets it."""
+    time = recording.accelerometer.time
+    per_second = 1e6 if "us" in name else 1.0
+    stamps = (time + np.where(np.arange(len(time)) > 1234, 1.7e9, 0.0)) * per_second
+    stamps = stamps.round().astype(np.int64) if per_second > 1 else stamps
+    one = read_recording(write(tmp_path / "log.csv", stamps, values_of(recording), name))
+    np.testing.assert_allclose(one.accelerometer.time, time - time[0], atol=2e-6)
+    assert any("set forward by 1.7e+09 s in 1 place (row 1237)" in note for note in one.notes)
+
+
+def test_a_pause_of_weeks_costs_no_memory(recording, tmp_path):
+    """A scan by parts of a second would hold a hundred million windows, and an even grid as many samples."""
+    time = recording.accelerometer.time
+    middle = len(time) // 2
+    stamps = np.where(np.arange(len(time)) > middle, time + 5e6, time)
+    path = write(tmp_path / "log.csv", stamps, values_of(recording))
+    tracemalloc.start()
+    assert main(["info", str(path)]) == 0
+    assert len(segment(read_recording(path)).intervals) >= 12
+    even = evenly_sampled(read_recording(path).gyroscope)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2e8 and even.paused and even.values.shape[1] == middle + 1 and even.start == 0
 
 
 def test_a_clock_that_was_set_back_does_not_go_on(recording, tmp_path):

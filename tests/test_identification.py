@@ -1,5 +1,6 @@
 """The terms of the Allan variance come back from simulated noise with intervals that cover, and from measured noise."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -320,6 +321,15 @@ def test_what_was_taken_out_is_said():
     assert "accelerometer: 2 outliers" in notes
     assert "accelerometer z: a warm-up of 3" in notes or "accelerometer z: a warm-up of 2.9" in notes
     assert [len(lines) for lines in found.lines["accelerometer"]] == [1, 0, 0]
+
+
+def test_a_step_after_a_pause_is_timed_by_the_log():
+    white = np.random.default_rng(8).standard_normal((21_000, 3))
+    time = np.arange(len(white)) / 100.0 + np.where(np.arange(len(white)) < 1000, 0.0, 90.0)
+    white[15_000:, 1] += 3.0
+    notes = "\n".join(analyse_noise(Recording(Signal(time, white, "m/s^2"), None)).notes)
+    step = re.search(r"accelerometer y: its level steps by 3.* after ([\d.]+) s", notes)
+    assert float(step[1]) == pytest.approx(time[15_000], abs=0.5) and "200 s that begin 100 s in" in notes
 
 
 def test_both_runs_of_a_measured_sensor_tell_the_same_terms(data_folder):

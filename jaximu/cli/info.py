@@ -289,7 +289,7 @@ def _at_rest(recording: Recording, repaired: Recording, findings: list[str]) -> 
     from jaximu.report.recording import signal_facts
 
     names = [name for name in _STILL if name in recording.signals]
-    start, still, rates = _still_seconds(repaired)
+    begins, still, rates = _still_seconds(repaired)
     length = signal_facts(recording.signals[names[0]], repaired.signals[names[0]])["duration"]
     if not still.any():
         return length, 0.0, 0.0, 0.0
@@ -305,7 +305,7 @@ def _at_rest(recording: Recording, repaired: Recording, findings: list[str]) -> 
     if len(rates) >= _PARTS and size.min() < _BIAS:  # a table's steady turn looks like a rest: the slowest is one
         near = lengths_of(rates - rates[size.argmin()]) < _STILL["gyroscope"][0]
         findings += [_offset(rates[near])] if near.sum() >= _PARTS else []
-    return length, rest, longest, float(start + first)
+    return length, rest, longest, float(begins[first])
 
 
 def _offset(rates: FloatArray) -> str:
@@ -386,18 +386,19 @@ def _tilt(force: FloatArray) -> float:
     return float(np.degrees(np.arccos(np.clip(up @ middle / max(np.linalg.norm(middle), 1e-9), -1.0, 1.0))).max())
 
 
-def _still_seconds(recording: Recording) -> tuple[float, BoolArray, FloatArray]:
-    """When the first of all seconds begins; which (n,) are at rest, by their scatter and how their means move; and the
-    means (n, 3) in them of the gyroscope, rad/s, or none.
+def _still_seconds(recording: Recording) -> tuple[FloatArray, BoolArray, FloatArray]:
+    """When the seconds (n,) begin; which are at rest, by their scatter and how their means move; and the means (n, 3)
+    in them of the gyroscope, rad/s, or none.
     """
     import numpy as np
 
     from jaximu.ground.vectors import lengths_of
-    from jaximu.recordings.segmentation import Moments
+    from jaximu.recordings.segmentation import Moments, windows_with_samples
 
     sensors = [(signal, _STILL[name][0]) for name, signal in recording.signals.items() if name in _STILL]
     start, rates = max(signal.time[0] for signal, _ in sensors), np.zeros((0, 3))
-    begins = start + np.arange(max(int(min(signal.time[-1] for signal, _ in sensors) - start), 0))
+    last = int(min(signal.time[-1] for signal, _ in sensors) - start) - 1.0
+    begins = start + windows_with_samples(sensors[0][0].time - start, last)
     still = np.ones(len(begins), bool)
     for signal, limit in sensors:
         mean, variance, count = Moments(signal).between(begins, begins + 1)
@@ -407,4 +408,4 @@ def _still_seconds(recording: Recording) -> tuple[float, BoolArray, FloatArray]:
         if len(sensors) == 1 and signal is recording.gyroscope:  # a table's steady turn scatters as little
             still &= lengths_of(mean) < _BIAS
         rates = mean if signal is recording.gyroscope else rates
-    return float(start), still, rates
+    return begins, still, rates

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -198,27 +199,26 @@ def _analysed(
     """Return the noise of a triad's axes in the longest recording, up to a frequency (Hz), its rate (Hz), and notes."""
     what = f"{longest.name}: the {name}"
     notes = []
-    values, rate = evenly_sampled(getattr(longest, name), what)
+    values, rate, start, paused = evenly_sampled(getattr(longest, name), what)
     for recording in recordings:
         if getattr(recording, name) is not None:
             at_rest(recording, name)
-    part = fillable(values[0])
-    size, lost = part.stop - part.start, np.isnan(values[0, part])
-    if size < values.shape[1]:
+    if paused:
         notes.append(
             f"{what} has pauses longer than what lies before them: its noise is that of the longest part between them, "
-            f"{size / rate:.0f} of {values.shape[1] / rate:.0f} s."
+            f"{values.shape[1] / rate:.0f} s that begin {start:.0f} s in."
         )
-    if lost.any():
+    if (lost := np.isnan(values[0])).any():
         notes.append(
             f"{longest.name}: {lost.sum()} samples of the {name} are missing; they are filled in by what lies "
             "before them, mirrored, and no difference of the deviation reaches over more than five in a row."
         )
     try:
-        axes = identify(values[:, part], rate, highest=highest)
+        axes = identify(values, rate, highest=highest)
     except NotPossibleError as error:
         raise NotPossibleError(f"{what}: {error}") from error
     assert isinstance(axes, list)
+    axes = [replace(it, steps=tuple(replace(step, time=start + step.time) for step in it.steps)) for it in axes]
     if highest is not None:
         notes.append(
             f"{name}: its terms are those of the spectrum below {highest:.2g} Hz, where the filter does nothing."
@@ -226,19 +226,31 @@ def _analysed(
     return axes, rate, notes
 
 
-def evenly_sampled(signal: Signal, what: str = "the signal") -> tuple[FloatArray, float]:
-    """Return (3, n) values in SI on an even grid, NaN where a sample is missing, and the rate (Hz).
+class EvenSamples(NamedTuple):
+    """Samples (3, n) in SI on an even grid, NaN where one is missing, the rate (Hz), and when they begin (s after the
+    first stamp). paused: a pause longer than what lies before it left out what is on its other side.
+    """
 
-    Of a signal whose rate changes, they are those of the longest stretch of one rate. Raises `InputError` where the
-    stamps do not lie near a grid.
+    values: FloatArray
+    rate: float
+    start: float
+    paused: bool
+
+
+def evenly_sampled(signal: Signal, what: str = "the signal") -> EvenSamples:
+    """Return the samples of the longest part of a signal that has one rate and no pause longer than what lies before.
+
+    Raises `InputError` where the stamps do not lie near a grid.
     """
     if len(signal) < 3:
         raise NotPossibleError(f"{what} has only {len(signal)} samples.")
-    part = max(stretches_of_one_rate(signal.time), key=lambda part: part.stop - part.start)
-    time = signal.time[part]
+    stretch = max(stretches_of_one_rate(signal.time), key=lambda part: part.stop - part.start)
+    time = signal.time[stretch]
     interval = np.diff(time)
     steps = np.maximum(1, (interval / np.median(interval)).round()).astype(np.int64)
     index = np.cumulative_sum(steps, include_initial=True)
+    part = fillable(index)
+    time, index = time[part], index[part] - index[part.start]
     slope, start = np.polyfit(index, time, 1)
     off = abs(time - start - slope * index) / slope
     if (off > _UNEVEN).mean() > 0.01:
@@ -248,8 +260,9 @@ def evenly_sampled(signal: Signal, what: str = "the signal") -> tuple[FloatArray
             "(_ in --columns) and give --rate."
         )
     values = np.full((signal.values.shape[1], index[-1] + 1), np.nan)
-    values[:, index] = signal.si()[part].T
-    return values, float(1 / slope)
+    values[:, index] = signal.si()[stretch][part].T
+    paused = len(time) < len(interval) + 1
+    return EvenSamples(values, float(1 / slope), float(time[0] - signal.time[0]), paused)
 
 
 def _taken_out(name: str, axes: Sequence[Identified]) -> list[str]:
@@ -290,7 +303,7 @@ def _taken_out(name: str, axes: Sequence[Identified]) -> list[str]:
 def at_rest(recording: Recording, triad: str) -> tuple[FloatArray, float]:
     """Return `evenly_sampled` values, outliers missing too, and the rate; `NotPossibleError` unless it rested."""
     what = f"{recording.name}: the {triad}"
-    values, rate = evenly_sampled(getattr(recording, triad), what)
+    values, rate, *_ = evenly_sampled(getattr(recording, triad), what)
     values = np.stack([without_outliers(axis)[0] for axis in values])
     _require_rest(values, rate, _STEP[triad], what)
     return values, rate

@@ -132,14 +132,16 @@ def _changes(means: FloatArray, span: int) -> FloatArray:
     return (sums[span + 1 :] - sums[: -span - 1]) / span
 
 
-def fillable(values: FloatArray) -> slice:
-    """Return the longest part of samples (n,) without a gap that is longer than what lies before it in the part."""
+def fillable(index: IntArray) -> slice:
+    """Return the longest part of samples at places (n,) of an even grid that has no gap longer than what lies before it
+    in the part.
+    """
     parts, first = [], 0
-    for start, stop in runs_of(np.isnan(values)):
-        if stop - start > start - first:
-            parts.append(slice(first, start))
-            first = stop
-    return max((*parts, slice(first, len(values))), key=lambda part: part.stop - part.start)
+    for last in np.flatnonzero(np.diff(index) > 1):
+        if index[last + 1] - index[last] > index[last] - index[first] + 2:
+            parts.append(slice(first, last + 1))
+            first = last + 1
+    return max((*parts, slice(first, len(index))), key=lambda part: index[part][-1] - index[part][0])
 
 
 def filled(values: FloatArray, longest: int | None = None) -> FloatArray:

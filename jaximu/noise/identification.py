@@ -178,10 +178,10 @@ def _identify(
     there = np.flatnonzero(~np.isnan(values))
     if len(there) < _SHORTEST:
         raise NotPossibleError(_NO_STRETCH)
+    there = there[fillable(there)]
     if np.ptp(values[there]) == 0:
         raise NotPossibleError(_CONSTANT)
     values = values[there[0] : there[-1] + 1]
-    values = values[fillable(values)]
     values, outliers = without_outliers(values)
     values, steps = without_steps(values, rate)
     whole = filled(values)  # for the spectrum; the deviation leaves long gaps out

@@ -102,6 +102,17 @@ def _windows(moments: Moments, centres: FloatArray, width: float) -> tuple[Float
     return mean, np.where(count >= max(3, 0.5 * width * moments.signal.rate), variance.sum(axis=1), np.inf)
 
 
+def windows_with_samples(time: FloatArray, last: float) -> FloatArray:
+    """Return the numbers 0, 1, … (W,) up to `last` of windows, less those further than 8 from every sample where two
+    neighbouring samples are over 32 apart. Samples are at times (n,), in windows: the clock may be set forward by
+    years.
+    """
+    pauses = np.flatnonzero(np.diff(time) > 32)
+    first = np.concatenate([[0.0], np.floor(time[pauses + 1]) - 8])
+    stop = np.concatenate([time[pauses] + 8, [np.inf]]).clip(max=last + 0.5)
+    return np.concatenate([np.arange(low, high) for low, high in zip(first, stop, strict=True)])
+
+
 def _floor(variance: FloatArray, moments: Moments) -> float:
     """The variance of windows at rest: the median of those near the lowest."""
     floor = floor_of(variance[np.isfinite(variance)])
@@ -150,7 +161,7 @@ class _Scan:
                 "at least nine orientations at rest for two seconds or more each, with turns between them."
             )
         step = width / 8
-        centres = np.arange(start, end + step / 2, step)
+        centres = start + step * windows_with_samples((signals[0].time - start) / step, (end - start) / step)
         moments = tuple(Moments(signal) for signal in signals)
         means, variances = zip(*(_windows(running, centres, width) for running in moments), strict=True)
         for signal, variance, name in zip(signals, variances, INERTIAL_QUANTITIES, strict=False):

@@ -65,6 +65,7 @@ from jaximu.recordings.recording import (
 _SMALL = 1 << 24  # bytes
 _TABLE = 200  # rows, up to which a file without time may be a table of pose means
 _SET_BACK = 1.0  # s: more than this is a clock that was set, not disorder
+_SET_FORWARD = 180 * 86400.0  # s: no logger rests so long within a recording
 _JITTER = 2.0  # sample periods that stamps may be off a steady clock for their rows to be in order
 _UNEVEN = 0.1  # of the period, that sorted stamps scatter by where they jitter
 _SETTINGS = {1800.0 * count for count in range(1, 24 + 1)}
@@ -582,7 +583,9 @@ def extract(
         for column, title in zip(columns, table.header, strict=True)
     ]
     used = column_units(table, wanted, option, "gyro" if option == "--gyro-columns" else None)
-    for put_right in (_stamped, _carried_on, _ordered if table.messages else _rising) if TIME in used else ():
+    for put_right in (
+        (_stamped, _set_forward, _carried_on, _ordered if table.messages else _rising) if TIME in used else ()
+    ):
         table = put_right(table, *used[TIME])
     stamps, origin, notes = _stamps(table, used, options)
     notes = [*table.notes, *notes]
@@ -632,6 +635,21 @@ def _stamped(table: LogTable, clock: int, unit: Unit) -> LogTable:
         return table
     note = f"{counted(int(missing.sum()), 'row')} without a time left out (row {table.row(missing.argmax())})."
     return table.take(np.flatnonzero(~missing)).noted(note)
+
+
+def _set_forward(table: LogTable, clock: int, unit: Unit) -> LogTable:
+    """The rows with a time that goes on where the clock was set forward by months, as from 1970 to now; and a note."""
+    stamps = table.numbers(clock)
+    steps = np.diff(stamps)
+    if not len(forward := np.flatnonzero(steps * unit.factor > _SET_FORWARD)):
+        return table
+    shift = np.zeros(len(stamps), stamps.dtype)
+    shift[forward + 1] = steps[forward] - np.median(steps).astype(stamps.dtype)
+    note = (
+        f"the clock is set forward by {steps[forward].max() * unit.factor:.6g} s in "
+        f"{counted(len(forward), 'place')} (row {table.row(forward[0] + 1)}): its time goes on from there."
+    )
+    return table.with_column(clock, stamps - shift.cumsum()).noted(note)
 
 
 def _carried_on(table: LogTable, clock: int, unit: Unit) -> LogTable:
@@ -742,8 +760,8 @@ def _rising(table: LogTable, clock: int, unit: Unit) -> LogTable:
         row = back[steps[back - 1].argmin()]
         raise InputError(
             f"{table.where(row)}: the clock goes back by {-steps[row - 1] * unit.factor:.6g} s, and the rows "
-            "from there on are not those of the same times before: two recordings in one file (data.order). Cut it "
-            "there."
+            "from there on are not those of the same times before: two recordings in one file, or a clock that was set "
+            "back (data.order). Cut it there."
         )
     if len(back) and ((kept_steps == 0).any() or close > before):
         return table  # sorting does not help: stamps are wrong, and which, the refusal says
