@@ -123,32 +123,38 @@ def errors(kind, protocol, recipe, at_rest, units):
         static = noise_of(resting(kind, long, rng)) if at_rest else None
         recording, during, after = drifted(recording, imu, kind, rng)
         calibration = recipe(recording, truth, static)
-        left = calibration.open_numbers
-        for name, triad in calibration.triads().items():
-            gain, bias = calibration.sigma(name)
-            known = (gain > 0) & [[f"{name}.gain[{i},{j}]" not in left for j in range(3)] for i in range(3)]
-            sure = np.array([f"{name}.bias[{i}]" not in left for i in range(3)])
-            found, recorded = np.asarray(triad.bias), calibration.bias_sigma_recording[name]
-            groups = {
-                "gains": ((np.asarray(triad.gain) - np.asarray(getattr(imu, name).gain)) / np.where(known, gain, 1))[
-                    known
-                ],
-                "bias in the recording": ((found - during[name]) / recorded)[sure],
-                "bias after it": ((found - after[name]) / bias)[sure],
-            }
-            for group, values in groups.items():
-                if len(values):
-                    rows.setdefault(f"{name}, {group}", []).append(values)
+        gains = {name: np.asarray(triad.gain) for name, triad in imu.triads().items()}
+        for group, values in in_sigmas(calibration, gains, during, after).items():
+            rows.setdefault(group, []).append(values)
     return rows
+
+
+def in_sigmas(calibration, gains, during, after):
+    """Return a unit's errors in stated sigmas by group of numbers, those left open not counted.
+
+    gains, during, after: the true gains, and biases as means over the recording and over as long again, by triad.
+    """
+    errors, left = {}, calibration.open_numbers
+    for name, triad in calibration.triads().items():
+        gain, bias = calibration.sigma(name)
+        known = (gain > 0) & [[f"{name}.gain[{i},{j}]" not in left for j in range(3)] for i in range(3)]
+        sure = np.array([f"{name}.bias[{i}]" not in left for i in range(3)])
+        found, recorded = np.asarray(triad.bias), calibration.bias_sigma_recording[name]
+        errors[f"{name}, gains"] = ((np.asarray(triad.gain) - gains[name]) / np.where(known, gain, 1))[known]
+        errors[f"{name}, bias in the recording"] = ((found - during[name]) / recorded)[sure]
+        errors[f"{name}, bias after it"] = ((found - after[name]) / bias)[sure]
+    return {group: values for group, values in errors.items() if len(values)}
 
 
 def bounds(rows, rng):
     """Return the root mean square, the share within 1.96, and its 99 % bounds by resampling units."""
-    width = min(map(len, rows))
-    values = np.stack([row[:width] for row in rows])
-    inside = np.mean(np.abs(values) < 1.959964, axis=1)
-    drawn = rng.choice(inside, (4000, len(inside))).mean(axis=1)
-    return float(np.sqrt(np.mean(values**2))), float(inside.mean()), *map(float, np.quantile(drawn, [0.005, 0.995]))
+    inside = np.array([np.mean(np.abs(row) < 1.959964) for row in rows])
+    counts = np.array([len(row) for row in rows], float)
+    drawn = rng.integers(len(rows), size=(4000, len(rows)))
+    shares = np.sum((inside * counts)[drawn], axis=1) / np.sum(counts[drawn], axis=1)
+    whole = np.concatenate(rows)
+    share = float(np.mean(np.abs(whole) < 1.959964))
+    return float(np.sqrt(np.mean(whole**2))), share, *map(float, np.quantile(shares, [0.005, 0.995]))
 
 
 def main() -> None:

@@ -730,12 +730,16 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What a logger would have written: time (n,) s, accel (n, 3) m/s², gyro (n, 3) rad/s, temperature (n,) °C."""
+    """What a logger would have written: time (n,) s, accel (n, 3) m/s², gyro (n, 3) rad/s, temperature (n,) °C.
+
+    drift: by sensor, the flicker noise's means (2, 3) over the recording and over as long again after it.
+    """
 
     time: np.ndarray
     accel: np.ndarray
     gyro: np.ndarray
     temperature: np.ndarray
+    drift: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def write(self, path: Path) -> Path:
         columns = {"time [s]": self.time}
@@ -746,7 +750,8 @@ class Recording:
 
 
 def flicker(random: np.random.Generator, samples: int, rate: float, size: float) -> np.ndarray:
-    """Three columns of 1/f noise, two-sided density size²/(2π|f|), flat below 1/(3.6 h); size in the output's unit.
+    """Three columns of 1/f noise over the samples and as many after them, two-sided density size²/(2π|f|), flat below
+    1/(3.6 h); size in the output's unit.
 
     Made at 10 Hz by shaping a random spectrum; above 5 Hz it would be lost in the white noise, a thousand times denser.
     """
@@ -757,7 +762,7 @@ def flicker(random: np.random.Generator, samples: int, rate: float, size: float)
     spectrum[:, 1:] = random.standard_normal((3, len(frequency), 2)) @ [1, 1j]
     spectrum[:, 1:] *= size * np.sqrt(count * slow / (4 * np.pi * np.maximum(frequency, 1 / FLICKER_SPAN)))
     noise, knots = np.fft.irfft(spectrum, count), np.arange(count) / slow
-    return np.stack([np.interp(np.arange(samples) / rate, knots, each) for each in noise], axis=-1)
+    return np.stack([np.interp(np.arange(2 * samples) / rate, knots, each) for each in noise], axis=-1)
 
 
 def quantised(output: np.ndarray, full_scale: float) -> np.ndarray:
@@ -852,15 +857,17 @@ class Case:
 
     def _logged(self, session: str, outputs: dict[str, np.ndarray], temperature: np.ndarray) -> Recording:
         samples, rate = len(temperature), self.protocol.rate
-        random = self.protocol.random(session, 2)
+        random, drift = self.protocol.random(session, 2), {}
         for sensor, output in outputs.items():
             if self.noisy:
                 noise = self.protocol.noise
                 output += noise * WHITE[sensor] * np.sqrt(rate) * random.standard_normal(output.shape)
-                output += flicker(random, samples, rate, noise * FLICKER[sensor] * self.protocol.flicker)
+                slow = flicker(random, samples, rate, noise * FLICKER[sensor] * self.protocol.flicker)
+                output += slow[:samples]
+                drift[sensor] = slow.reshape(2, samples, 3).mean(axis=1)
             if self.quantise:
                 outputs[sensor] = quantised(output, RANGE[sensor])
-        return Recording(np.arange(samples) / rate, outputs["accel"], outputs["gyro"], temperature)
+        return Recording(np.arange(samples) / rate, outputs["accel"], outputs["gyro"], temperature, drift)
 
 
 def draw_case(
