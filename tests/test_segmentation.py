@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.signal
+from scipy.stats import binom
 from simulated_person import GRAVITY as PERSON_GRAVITY
 from simulated_person import Person
 from synthetic import GRAVITY, POSES, recording, simulated, spread_directions, unit
@@ -174,6 +175,25 @@ def test_too_short():
     log, _ = recording(10, poses=1, rest=0.3)
     with pytest.raises(NotPossibleError, match="too short"):
         segment(log)
+
+
+@pytest.mark.parametrize("noise", [0.03, 0.1, 0.3, 1.0])
+def test_the_mean_of_coarse_steps_is_no_better_than_its_interval(noise):
+    """Where noise is a part of the step, a rest may lie within one, or flip between two at any share of the time."""
+    step, off = np.radians(1.0), []
+    intervals = 4.0 * np.arange(20)[:, None] + [0.05, 2.9]
+    time = np.arange(20 * 400) / 100
+    turning = (time % 4.0 > 3.0)[:, None] * 0.5
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        bias = rng.uniform(-0.05, 0.05, 3)
+        values = bias + (noise * step + turning) * rng.standard_normal((len(time), 3))
+        signal = Signal(time, np.round(values / step) * step, "rad/s")
+        _, mean, covariance = rest_statistics(signal, intervals, turning=True)
+        weight = 1 / np.diagonal(covariance, axis1=1, axis2=2)
+        off.append(((mean * weight).sum(axis=0) / weight.sum(axis=0) - bias) * np.sqrt(weight.sum(axis=0)))
+    inside = int((np.abs(off) < 1.96).sum())
+    assert inside >= binom.ppf(1e-4, 120, 0.95) and np.max(np.abs(off)) < 4.5
 
 
 @pytest.mark.parametrize("quantum", [(0.04, 0.002), (0.15, 0.01)])

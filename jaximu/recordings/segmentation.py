@@ -366,7 +366,7 @@ def rest_statistics(
     share = total / max(np.median(total), signal.rounding_variance)  # coarse steps may leave no scatter at all
     calm = [column for column, size in zip(columns, share, strict=True) if size < 2] or columns
     (density, _), sway = _density(signal, calm), np.zeros((3, 3))
-    rounding = np.diag(np.square(signal.nominal_scale)) * _rounding_of_means(signal, variances)[:, None, None]
+    rounding = _rounding(signal, columns).T[:, :, None] * np.eye(3)
     if turning:
         density, sway = _without_sway(signal, calm, density)
         rounding = rounding * len(intervals)  # every pose reads the same rate, and rounds it the same way
@@ -451,20 +451,16 @@ def _of_blocks(signal: Signal, columns: Sequence[FloatArray], size: int) -> tupl
     return (scatter + 1e-3 * quantum) * size / signal.rate, int(np.maximum(number - 1, 0).sum())
 
 
-def _rounding(signal: Signal, part: Segmentation) -> FloatArray:
-    """(3, P) variance, in output units, by which rounding shifts the means of a recording's poses."""
-    variances = Moments(signal).between(*part.intervals.T)[1]
-    return np.square(signal.nominal_scale)[:, None] * _rounding_of_means(signal, variances)
-
-
-def _rounding_of_means(signal: Signal, variances: FloatArray) -> FloatArray:
-    """(P,) variance, in SI, by which rounding to steps shifts the means of intervals, given their variances (P, 3).
+def _rounding(signal: Signal, columns: Sequence[FloatArray]) -> FloatArray:
+    """(3, P) variance, in output units, by which rounding to steps shifts the means of intervals, given their samples.
 
     Noise of σ dithers a step q: what is left of the mean's error is q/π · exp(−2π²σ²/q²), of random sign and phase,
-    and at most that of rounding itself.
+    and at most that of rounding itself. Samples of one level, or of two, do not tell the noise.
     """
-    rounding = signal.rounding_variance / 3
-    quiet = np.maximum(variances.mean(axis=1) / rounding - 1, 0.0)  # σ² over q²/12
+    step = signal.step * signal.nominal_scale
+    rounding = np.maximum(step**2 / 12, 1e-30)[:, None]
+    variance, spread = (np.array([size(column, axis=1) for column in columns]).T for size in (np.var, np.ptp))
+    quiet = np.maximum(variance / rounding - 1, 0.0) * (spread > 1.5 * step[:, None])  # σ² over q²/12
     return rounding * np.minimum(1.0, 6 / np.pi**2 * np.exp(-(np.pi**2) / 3 * quiet))
 
 
@@ -637,7 +633,9 @@ def _with_noise(observations: Observations, parts: Sequence[Segmentation], noise
         """
         white, slow = noise_by_model(signals[name], getattr(noise, name), name, start, stop, same)
         slow[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)[:count]
-        return white, slow, np.concatenate([_rounding(part.recording.signals[name], part) for part in parts], axis=1)
+        recorded = [(part.recording.signals[name], part.intervals) for part in parts]
+        rounding = [_rounding(signal, _samples(signal, intervals)) for signal, intervals in recorded]
+        return white, slow, np.concatenate(rounding, axis=1)
 
     forces, rates = (np.tile(np.eye(size), (3, 1, 1)) for size in (padded, padded + _PARTS * len(turns.mask)))
     _, slow, rounding = by_model("accelerometer", start, stop, power_on[:, None] == power_on)
