@@ -10,8 +10,10 @@ from jaximu.calibration import calibrate
 from jaximu.cli import main
 from jaximu.ground.errors import InputError
 from jaximu.mistakes import inspect
+from jaximu.mistakes.timing import steady_clock
 from jaximu.noise.analysis import evenly_sampled
 from jaximu.recordings.readers import ReadOptions, advise_reading, read_recording
+from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld
@@ -488,3 +490,20 @@ def test_a_folder_is_answered_with_what_lies_in_it(recording, tmp_path, capsys):
     assert "it holds log.csv, more.csv" in said and f"jaximu fleet {tmp_path}" in said
     assert main(["help", "calibrat"]) == 2
     assert "did you mean calibrate" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("delay", [None, 0.0, 0.02])
+def test_the_rate_of_stamps_in_bursts_is_known_as_well_as_stated(delay):
+    """Stamps cut to whole seconds, and packets of ten that come as late as chance has it."""
+    off = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        rate = 100 * (1 + 1e-3 * rng.standard_normal())
+        taken = rng.uniform() + np.arange(int(rng.uniform(50, 120) * rate)) / rate
+        packet = np.arange(len(taken)) // 10
+        arrival = taken[(10 * packet + 9).clip(max=len(taken) - 1)] + rng.exponential(delay or 0.0, len(taken))[packet]
+        time = np.floor(taken) if delay is None else np.maximum.accumulate(arrival)
+        gyroscope = steady_clock(Recording(None, Signal(time, np.zeros((len(time), 3)), "rad/s"))).gyroscope
+        slope = np.ptp(gyroscope.time) / (len(time) - 1)
+        off.append((slope * rate - 1) / gyroscope.clock_sigma)
+    assert np.sqrt(np.mean(np.square(off))) < 1.5

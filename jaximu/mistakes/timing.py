@@ -53,7 +53,7 @@ def _timing(name: str, sensor: Sensor, alike: Sequence[Sensor]) -> Iterator[Find
     interval = sensor.interval
     mean = np.mean(interval)
     if in_bursts(interval):
-        rate, lag = 1 / _clock(sensor.time)[1], np.median(interval[interval > _PAUSE * mean])
+        rate, lag = (len(interval) / np.ptp(_clock(sensor.time)[0])), np.median(interval[interval > _PAUSE * mean])
         yield Finding(
             "data.bursts",
             sensor.rows(np.flatnonzero(interval > _PAUSE * mean)[:5] + 1),
@@ -190,19 +190,22 @@ def in_bursts(interval: FloatArray) -> bool:
 
 
 def _clock(time: FloatArray) -> tuple[FloatArray, float]:
-    """Stamps of a steady clock fitted to arrival times, in stretches between pauses in the log, and its period.
+    """Stamps of a steady clock fitted to arrival times, in stretches between pauses in the log, and one sigma of its
+    rate, as a share.
 
-    Delays are never negative, so the clock goes through the earliest arrivals of each second: one sensor may come in
-    bursts and another not.
+    The bursts' first samples tell the rate. Delays are never negative, so the clock goes through the earliest arrivals
+    of each second: one sensor may come in bursts and another not.
     """
     index = np.arange(len(time), dtype=float)
-    fitted, slope = _line(index, time)
+    interval = np.diff(time)
+    begins = 1 + np.flatnonzero(interval > _PAUSE * np.mean(np.minimum(interval, 20 * np.mean(interval))))
+    slope, start = np.polyfit(index[begins], time[begins], 1)
+    fitted = start + slope * index
     delay = time - fitted
     # what stays off the line from one sample on is a gap in the log, not a delay
     width = max(8, round(1.0 / max(slope, 1e-9)))
     if np.ptp(delay) > 20 * np.median(np.abs(delay)) + 1e-9:
-        steps = np.diff(time)
-        edges = np.concatenate([[0], np.flatnonzero(steps > 12 * np.quantile(steps, 0.99)) + 1, [len(time)]])
+        edges = np.concatenate([[0], np.flatnonzero(interval > 12 * np.quantile(interval, 0.99)) + 1, [len(time)]])
         parts = [np.polyfit(index[a:b], time[a:b], 1) for a, b in pairwise(edges) if b - a > width]
         if parts:
             slope = np.median([part[0] for part in parts])
@@ -212,14 +215,16 @@ def _clock(time: FloatArray) -> tuple[FloatArray, float]:
             if np.any(np.diff(fitted) <= 0):
                 fitted, slope = _line(index, time)
     early = [part.min() for part in np.array_split(time - fitted, max(1, len(time) // width))]
-    return fitted + np.median(early), float(slope)
+    share = np.sqrt(np.var((time - fitted)[begins]) / slope**2 + 1 / 12)  # a burst begins at a whole sample
+    return fitted + np.median(early), float(share / np.std(begins) / np.sqrt(len(begins)))
 
 
 def steady_clock(recording: Recording) -> Recording:
     """Return the recording with the stamps of sensors that arrive in bursts replaced by those of a steady clock."""
+    clocks = {
+        name: _clock(signal.time) for name, signal in recording.signals.items() if in_bursts(np.diff(signal.time))
+    }
     changed = {
-        name: replace(signal, time=_clock(signal.time)[0])
-        for name, signal in recording.signals.items()
-        if in_bursts(np.diff(signal.time))
+        name: replace(recording.signals[name], time=time, clock_sigma=sigma) for name, (time, sigma) in clocks.items()
     }
     return replace(recording, **changed)
