@@ -225,6 +225,7 @@ def test_units_in_one_file_are_those_in_files_of_their_own(tmp_path, layout, cap
     document = json.loads(capsys.readouterr().out)
     np.testing.assert_allclose(document["units"][1]["position"], moved()[1].place, atol=3e-4)
     if len(files) == 1:
+        assert f"{files[0].name} (2)" in (tmp_path / "out" / "report.html").read_text()
         assert main(["calibrate", *stated[:3]]) == 2
         assert "several in one log are for jaximu array" in capsys.readouterr().err
     if layout == "ids":

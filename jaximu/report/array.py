@@ -22,8 +22,8 @@ def page_of(array: Array) -> Page:
         f"An array of {len(array.units)} units",
         (
             *(
-                f"{Path(name).name} disturbs the array."
-                for name in dict.fromkeys(unit.name for unit, *_ in array.suspects())
+                f"{label} disturbs the array."
+                for label in dict.fromkeys(_label(array, unit) for unit, *_ in array.suspects())
             ),
             f"At rest the weighted mean of all {len(array.units)} units has {rate:.2g} times less gyroscope noise and "
             f"{force:.2g} times less accelerometer noise than a typical unit.",
@@ -47,6 +47,12 @@ def page_of(array: Array) -> Page:
     )
 
 
+def _label(array: Array, unit: ArrayUnit) -> str:
+    """Return a unit's file, and its number where several are in one file, by columns or IDs."""
+    name, number = Path(unit.name).name, 1 + [other is unit for other in array.units].index(True)
+    return f"{name} ({number})" if [other.name for other in array.units].count(unit.name) > 1 else name
+
+
 def _next(array: Array) -> str:
     for unit, *_ in array.suspects():
         return f"`jaximu diagnose {shlex.quote(unit.name)} -o RESULTS` looks for the cause of its scatter."
@@ -57,7 +63,7 @@ def _next(array: Array) -> str:
 def _suspects(array: Array) -> Iterator[Statement]:
     for unit, words, times in array.suspects():
         yield Statement(
-            Path(unit.name).name,
+            _label(array, unit),
             f"It scatters {times:.2g} times as far about the shared motion as a typical unit in {words}: look for the "
             "cause with `jaximu diagnose`, or leave it out of the mean.",
             True,
@@ -83,7 +89,7 @@ def _table(array: Array) -> Table:
     marked = [index for index, unit in enumerate(array.units) if any(unit is suspect for suspect in suspects)]
     return Table(
         ("unit", "turned [°]", "position x, y, z [mm]", "clock late by [ms]", "scatter [°/s]", "scatter [m/s²]"),
-        [_row(unit, unit is array.units[0]) for unit in array.units],
+        [(_label(array, unit), *_row(unit, unit is array.units[0])) for unit in array.units],
         "± is 95 %; positions in the first unit's axes. Scatter: standard deviation of an axis about the motion that "
         "all units share, over eight samples.",
         marked,
@@ -95,7 +101,6 @@ def _row(unit: ArrayUnit, first: bool) -> tuple[str, ...]:
     position = ", ".join(map(with_interval, 1e3 * unit.position, 1e3 * unit.position_sigma))
     angle = np.degrees(2 * np.arccos(min(1.0, abs(unit.rotation[0]))))
     return (
-        Path(unit.name).name,
         "the first" if first else with_interval(angle, np.degrees(unit.rotation_sigma.max())),
         "0" if first else position,
         "0" if first else with_interval(1e3 * unit.time_offset, 1e3 * unit.time_offset_sigma),
