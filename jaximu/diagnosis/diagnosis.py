@@ -1004,16 +1004,15 @@ def _named(experiment: Experiment, state: State, entry: Found, gain: Gain | None
 
 def stated_instead(name: str) -> list[tuple[type[Effect], str]]:
     """Return what an option states, of an effect and its look-alikes, and the sentence that asks for the option."""
-    plain = name.partition("@")[0]
-    alike = listed([effect_title(other) for other in CATALOGUE[name].look_alikes], "or")
+    plain, rivals = name.partition("@")[0], CATALOGUE[name].look_alikes
+    stated = [CATALOGUE[other] for other in (plain, *rivals) if CATALOGUE[other].stated_by]
+    alike = f" looks like {listed([*map(effect_title, rivals)], 'or')}" if rivals else " can be stated"
     return [
         (
-            CATALOGUE[other],
-            f"{sentence(effect_title(plain))} looks like {alike}. State {CATALOGUE[other].stated_by}: "
-            f"{CATALOGUE[other].english} is then taken off.",
+            effect,
+            f"{sentence(effect_title(plain))}{alike}. State {effect.stated_by}: {effect.english} is then taken off.",
         )
-        for other in (plain, *CATALOGUE[name].look_alikes)
-        if CATALOGUE[other].stated_by
+        for effect in stated
     ]
 
 

@@ -66,6 +66,7 @@ _SMALL = 1 << 24  # bytes
 _TABLE = 200  # rows, up to which a file without time may be a table of pose means
 _SET_BACK = 1.0  # s: more than this is a clock that was set, not disorder
 _SET_FORWARD = 180 * 86400.0  # s: no logger rests so long within a recording
+_STRAY = 1000.0  # usual steps that a single stamp must be off both neighbours to be none
 _JITTER = 2.0  # sample periods that stamps may be off a steady clock for their rows to be in order
 _UNEVEN = 0.1  # of the period, that sorted stamps scatter by where they jitter
 _SETTINGS = {1800.0 * count for count in range(1, 24 + 1)}
@@ -629,12 +630,20 @@ def _per_second(unit: Unit, sensor: str, stamps: FloatArray) -> Unit:
 
 
 def _stamped(table: LogTable, clock: int, unit: Unit) -> LogTable:
-    """The rows without a few that have no time in the column `clock`, with a note."""
-    missing = np.isnan(table.numbers(clock))
-    if not 0 < missing.mean() <= FEW:
+    """The rows without a few that have no time in the column `clock`, or one far from both neighbours'; with a note."""
+    stamps = table.numbers(clock)
+    missing = np.isnan(stamps)
+    if 0 < missing.mean() <= FEW:
+        note = f"{counted(int(missing.sum()), 'row')} without a time left out (row {table.row(missing.argmax())})."
+        return _stamped(table.take(np.flatnonzero(~missing)).noted(note), clock, unit)
+    steps = np.diff(stamps)
+    before, after, far = steps[:-1], steps[1:], _STRAY * np.median(np.abs(steps)) if len(steps) else 0.0
+    stray = np.flatnonzero((np.abs(before) > far) & (np.abs(after) > far) & (np.abs(before + after) <= far)) + 1
+    if not 0 < len(stray) <= FEW * len(stamps):
         return table
-    note = f"{counted(int(missing.sum()), 'row')} without a time left out (row {table.row(missing.argmax())})."
-    return table.take(np.flatnonzero(~missing)).noted(note)
+    rows = "row whose stamp is" if len(stray) == 1 else "rows whose stamps are"
+    note = f"{len(stray)} {rows} far from those around left out (row {table.row(stray[0])})."
+    return table.take(np.delete(np.arange(len(stamps)), stray)).noted(Defect("data.order", note))
 
 
 def _set_forward(table: LogTable, clock: int, unit: Unit) -> LogTable:
