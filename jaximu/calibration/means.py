@@ -13,7 +13,6 @@ from jaximu.calibration.refusals import require_determined
 from jaximu.data.poses import EXCESS_NAMES, PosesAndTurns, residual_rms
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.problem import Loss, names_of, without_equipment_or_effects
-from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.quantities import listed
@@ -50,16 +49,15 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
     method = "accelerometer" if recording.gyroscope is None else "joint"
     free = [name for name in names_of(nominal) if name.owner == "accelerometer" and without_equipment_or_effects(name)]
     few = means.accelerometer_sigma is None and poses < len(free) + _SPARE
-    prior, measured, excess = None, observations, None
+    prior, excess = None, None
     if few or (poses >= _FACES and _open(means)):
         prior = known_misalignments(nominal, free)
         spare = poses - (len(free) - len(prior.names))
         _require_axes(means, len(free), spare)
-        measured = observe_means(_as_written(means), gravity.value)
         excess = None if spare >= _SPARE else np.zeros(len(EXCESS_NAMES))
         written = few * " The means are taken to be as good as their digits."
         notes += (MISALIGNMENTS_HELD.format(poses) + written,)
-    at_rest = PosesAndTurns.of(measured, "norm" if method == "accelerometer" else "all")
+    at_rest = PosesAndTurns.of(observations, "norm" if method == "accelerometer" else "all")
     fitted = fit(nominal, at_rest, prior=prior, loss=loss, excess=excess, estimate_excess=excess is None)
     require_determined(fitted, recording.name, poses=poses)
     if method == "accelerometer":
@@ -97,24 +95,6 @@ def _open(means: PoseMeans) -> bool:
     values = means.recording.accelerometer.si()
     upright = (values - (values.max(axis=0) + values.min(axis=0)) / 2) / STANDARD_GRAVITY
     return bool(np.sort(abs(upright), axis=1)[:, 1].max() < _UPRIGHT)
-
-
-def _as_written(means: PoseMeans) -> PoseMeans:
-    """Return the means as good as their digits, where they do not state how good they are."""
-    if means.accelerometer_sigma is not None:
-        return means
-    values = means.recording.accelerometer.values
-    return replace(means, accelerometer_sigma=np.full(values.shape, _step(values) / np.sqrt(12)))
-
-
-def _step(values: FloatArray) -> float:
-    """Return the step (m/s²) of the digits in which a table is written, in m/s² or in g."""
-    for digits in range(7):
-        for unit in (1.0, STANDARD_GRAVITY):
-            scaled = values / unit * 10.0**digits
-            if (abs(scaled - scaled.round()) < 1e-6 * np.maximum(abs(scaled), 1.0)).all():
-                return unit * 10.0**-digits
-    return 1e-6
 
 
 def _require_axes(means: PoseMeans, parameters: int, spare: int) -> None:

@@ -16,8 +16,12 @@ from jaximu.recordings.recording import runs_of
 
 BRIDGED = 5
 """Samples missing in a row that are filled in: a few in a thousand change no term, but would break long averages."""
-_SPIKE = 8.0
-"""Standard deviations off its neighbours from which a sample is an outlier: Gaussian noise has none in 10¹⁴."""
+_BESIDE = 256
+"""Samples on either side of a gap, at the least, whose level it is filled about: what scatters there is no level."""
+_SPIKE = 7.0
+"""Standard deviations off its neighbours from which a sample is an outlier: Gaussian noise has none in 10¹¹."""
+_MOST_SPIKES = 0.01
+"""Share of the samples up to which outliers are errors; more of them are a property of the noise."""
 FALSE_LINE = 1e-6
 """Probability that noise alone shows a line somewhere on an axis."""
 _MOST_LINES = 20
@@ -42,8 +46,8 @@ def without_outliers(values: FloatArray) -> tuple[FloatArray, int]:
 
     A sample is suspected where it is far off the mean of its two neighbours by the scale of most such differences
     (1.4826 times the median of their sizes, D. Hoaglin et al., Understanding Robust and Exploratory Data Analysis,
-    1983), and is one if it and not its neighbour is far off the median of those around. More than one in a thousand are
-    a property of the noise, and stay.
+    1983), and is one if it and not its neighbour is far off the median of those around. Where they are more than one in
+    a hundred, they stay.
     """
     middle = values[1:-1] - (values[:-2] + values[2:]) / 2
     sizes = abs(middle[~np.isnan(middle)])
@@ -57,15 +61,15 @@ def without_outliers(values: FloatArray) -> tuple[FloatArray, int]:
         # quantised: most differences are equal or none, and their median is a matter of a step
         scale = max(scale, float(np.quantile(sizes, 0.99)) / 2.576, float(steps.min()))
     suspected = 1 + np.flatnonzero(abs(middle) > _SPIKE / 2 * scale)  # of two spikes in a row each shows half
-    if not len(suspected) or len(suspected) > 0.01 * len(values):
+    if not len(suspected) or len(suspected) > 5 * _MOST_SPIKES * len(values):
         return values, 0
     near = np.unique((suspected[:, None] + np.arange(-2, 3)).clip(0, len(values) - 1))
     around = (near[:, None] + np.arange(-8, 9)).clip(0, len(values) - 1)
     level = np.nanmedian(values[around], axis=1)
     usual = 1.4826 * np.nanmedian(abs(values[around] - level[:, None]), axis=1)
     # where the signal itself wanders, as a walk does, the scatter around says how far a sample may be
-    far = near[abs(values[near] - level) > _SPIKE * np.maximum(scale, usual)]
-    if len(far) > 1e-3 * len(values):
+    far = near[abs(values[near] - level) > _SPIKE * np.maximum(scale / np.sqrt(1.5), usual)]
+    if len(far) > _MOST_SPIKES * len(values):
         return values, 0
     if len(far):
         values = values.copy()
@@ -146,24 +150,25 @@ def fillable(index: IntArray) -> slice:
 
 def filled(values: FloatArray, longest: int | None = None) -> FloatArray:
     """Return the samples with gaps of up to `longest` filled by the samples before them, mirrored about a straight
-    line between the levels on both sides: their spectrum is that of the noise, as a straight line's is not.
+    line between the levels on both sides, every other time with the sign turned round: their spectrum is that of the
+    noise, as a straight line's is not, and nothing is counted twice.
     """
     lost = np.isnan(values)
     if not lost.any():
         return values
     values = values.copy()
-    for first, last in runs_of(lost):
+    for number, (first, last) in enumerate(runs_of(lost)):
         size = last - first
         if (longest is not None and size > longest) or first == 0 or last == len(values):
             continue
-        before = values[max(0, first - max(size, 16)) : first]  # filled already
-        after = values[last : last + max(size, 16)]
+        before = values[max(0, first - max(size, _BESIDE)) : first]  # filled already
+        after = values[last : last + max(size, _BESIDE)]
         before, after = before[~np.isnan(before)], after[~np.isnan(after)]
         if not len(before) or not len(after):
             continue
         level = before.mean()
         level_after = after.mean()
-        scatter = np.resize(before[::-1] - level, size)
+        scatter = (-1) ** number * np.resize(before[::-1] - level, size)
         values[first:last] = level + (level_after - level) * np.arange(1, size + 1) / (size + 1) + scatter
     return values
 

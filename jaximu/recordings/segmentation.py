@@ -16,7 +16,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import counted
 from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.tracing import padded_size
-from jaximu.ground.units import INERTIAL_QUANTITIES
+from jaximu.ground.units import INERTIAL_QUANTITIES, STANDARD_GRAVITY
 from jaximu.ground.vectors import lengths_of, variances_of
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE
@@ -564,10 +564,21 @@ def observe_means(means: PoseMeans, gravity: float) -> Observations:
         values, covariance = _no_means(count)
         if signal is not None:
             if sigma is None:
-                sigma = np.tile(signal.nominal_scale * np.sqrt(signal.rounding_variance / 3), (count, 1))
+                sigma = np.full((count, 3), _written_step(signal) / np.sqrt(12))
             values, covariance = signal.values, sigma[:, :, None] ** 2 * np.eye(3)
         columns |= {f"{name}_mean": values, f"{name}_covariance": covariance}
     return _padded(columns, [], np.eye(3), accelerometer.nominal_offset, gravity)
+
+
+def _written_step(signal: Signal) -> float:
+    """Return the step, in output units, of the digits in which a table is written, in SI, g or °/s."""
+    units = {"m/s^2": STANDARD_GRAVITY, "rad/s": np.radians(1.0)}
+    for digits in range(9):
+        for unit in (1.0, units.get(signal.unit, 1.0)):
+            scaled = signal.values / unit * 10.0**digits
+            if (abs(scaled - scaled.round()) < 1e-6 * np.maximum(abs(scaled), 1.0)).all():
+                return unit * 10.0**-digits
+    return 1e-9
 
 
 def _padded(
