@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+import scipy.signal
 import scipy.spatial.transform
 from numpy.testing import assert_allclose
 
@@ -32,7 +33,7 @@ from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import ReadOptions, ScheduleEntry, read_recording, read_reference, read_schedule
-from jaximu.recordings.recording import Signal
+from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.reference import entries_of_columns
 from jaximu.simulation import consumer_noise, simulate
 from jaximu.simulation.protocols import (
@@ -656,3 +657,21 @@ def test_command(box, schedule, tmp_path, capsys):
     assert main(["turntable", str(log), "--reference", str(tmp_path / "none.csv")]) == 2
     assert main(["turntable", str(log)]) == 2
     assert "has no reference columns" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("column", ["table_rate", "table_angle"])
+def test_a_table_that_turns_to_and_fro_turns_each_time(column):
+    time = np.arange(3000) / 100.0
+    rate = np.where((time > 5) & (time < 25), np.radians(200) * scipy.signal.sawtooth(time * 2 * np.pi / 8, 0.5), 0.0)
+    gyroscope = rate[:, None] * [0.0, 0.0, 1.0] + 1e-4 * np.random.default_rng(0).standard_normal((3000, 3))
+    table = {"table_rate": rate, "table_angle": np.cumsum(rate) / 100}[column]
+    recording = Recording(
+        Signal(time, np.tile([0.0, 0.0, 9.8], (3000, 1)), "m/s^2"),
+        Signal(time, gyroscope, "rad/s"),
+        **{column: Signal(time, table[:, None], "rad/s" if column == "table_rate" else "rad")},
+    )
+    turns = [entry for entry in entries_of_columns(recording) if entry.kind == "turn"]
+    shown = [np.sum(gyroscope[(time >= turn.start) & (time < turn.stop), 2]) / 100 for turn in turns]
+    assert len(turns) >= 4 and {np.sign(turn.angle) for turn in turns} == {-1.0, 1.0}
+    np.testing.assert_allclose([turn.angle * turn.vector[2] for turn in turns], shown, atol=0.02)
+    assert max(abs(turn.angle) for turn in turns) > np.radians(300)

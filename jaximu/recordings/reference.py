@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import scipy
@@ -315,8 +316,15 @@ def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray)
         heading = np.interp((start + stop) / 2, time, angle) if recording.table_angle is not None else None
         entries.append(ScheduleEntry(start, stop, "pose", up, heading=heading))
         if index + 1 < len(spans) and up @ ups[index + 1] > 0.5:
-            following = spans[index + 1, 0]
-            turned = float(np.interp(following, time, angle) - np.interp(stop, time, angle))
-            if abs(turned) > _SMALLEST_TURN and following - stop < _LONGEST_TURN:
-                entries.append(ScheduleEntry(stop, following, "turn", up, turned))
+            edges = np.array([stop, *_turned_back(time, angle, stop, spans[index + 1, 0]), spans[index + 1, 0]])
+            for (begin, end), turned in zip(pairwise(edges), np.diff(np.interp(edges, time, angle)), strict=True):
+                if abs(turned) > _SMALLEST_TURN and end - begin < _LONGEST_TURN:
+                    entries.append(ScheduleEntry(begin, end, "turn", up, float(turned)))
     return entries
+
+
+def _turned_back(time: FloatArray, angle: FloatArray, start: float, stop: float) -> FloatArray:
+    """Return when between two rests a table's angle (n,) turns back: what it turns to and fro is no turn in all."""
+    during = (time > start) & (time < stop)
+    back = [scipy.signal.find_peaks(sign * angle[during], prominence=_SMALLEST_TURN)[0] for sign in (1, -1)]
+    return time[during][np.sort(np.concatenate(back))]
