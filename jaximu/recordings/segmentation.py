@@ -29,10 +29,11 @@ _PARTS = 4  # of a turn, over each of which slow bias is taken as constant
 _SHORTEST = 0.25  # s; what is correlated over less than this is white noise to poses and turns
 _ONSET = np.radians(100.0)  # rad/s³; the rate of a quarter turn in three seconds grows by so much times t² at first
 _CHANCE = 3.0  # standard deviations
+_SWINGS = np.radians(1.0)  # rad/s, rms of mean rates over windows; what lies still does less, and drifts less
 _TORN = 10.0  # times what the gyroscope shows, that gravity cannot turn by
 _BRIDGED = 3e-4  # rad; error that a gap may bring into a turn
 _LONGEST_TURN = 60.0  # s; beyond it, gyroscope drift tells more about itself than about the gain
-_STOP_WINDOW, _LEAST_OF_STOP = 1.0, 1.0  # s; and what a stop must have left beside half a window at either end
+_STOP_WINDOW, _LEAST_OF_STOP = 1.0, 0.5  # s; and what a stop must have left beside half a window at either end
 _PARTED = 0.8  # share of the variance of log variances between two classes; evenly spread values have 0.75
 _STEADY = 0.1  # m/s²; how far the mean force over a second of a stop may lie from the stop's
 _UPRIGHT, _TURNED = np.radians(25.0), 0.1
@@ -214,7 +215,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     intervals, notes = _drop_rotating(scan.moments, results[chosen][0])
     if len(intervals) < options.fewest:
         raise NotPossibleError(
-            f"{recording.name}: {_why_no_poses(results[chosen][0], centres[-1] - centres[0], means[0], notes)}"
+            f"{recording.name}: {_why_no_poses(results[chosen][0], centres[-1] - centres[0], means, notes)}"
         )
     tried = dict(zip(factors, counts, strict=True))
     torn, remarks = _torn(scan.moments, intervals)
@@ -289,14 +290,19 @@ def _parting(values: FloatArray) -> tuple[float, float]:
     return float(values[best : best + 2].mean()), float(between[best] / max(values.var(), 1e-300))
 
 
-def _why_no_poses(intervals: FloatArray, duration: float, force: FloatArray, notes: Sequence[str]) -> str:
-    """Say what a recording without poses is instead, and what to record; `force` (W, 3) as it was read."""
+def _why_no_poses(intervals: FloatArray, duration: float, means: tuple[FloatArray, ...], notes: Sequence[str]) -> str:
+    """Say what a recording without poses is instead, and what to record; `means` (W, 3) of the windows, by sensor."""
     record = (
         "A calibration needs at least nine orientations: hold the unit still for two seconds or more in each, and turn "
         "it between them."
     )
+    force, *rates = means
     off = _angles(force, np.median(force, axis=0))
-    if np.quantile(off, 0.99) < _DISTINCT and np.diff(intervals).sum() > 0.5 * duration:
+    upright = np.quantile(off, 0.99) < _DISTINCT and np.diff(intervals).sum() > 0.5 * duration
+    swing = [np.sqrt(np.mean((rate - np.median(rate, axis=0)) ** 2) * 3) for rate in rates]
+    if upright and swing and swing[0] > _SWINGS:
+        return f"0 static poses found: the unit swings by {np.degrees(swing[0]):.2g} °/s (rms) throughout. {record}"
+    if upright:
         return (
             "1 static pose found: the unit lay in one orientation throughout. That shows its noise (jaximu allan) and, "
             f"with a temperature beside it, its drift (jaximu thermal). {record}"
