@@ -19,6 +19,7 @@ from jaximu.calibration.in_use import INTERVAL, FilterInUse, follow
 from jaximu.calibration.recipe import Choices, calibrate_ready, carried_error, require_gravity
 from jaximu.calibration.systematic import noise_at_rest
 from jaximu.data.by_hand import RecordedByHand
+from jaximu.data.motion import LONGEST_MOTION
 from jaximu.diagnosis.comparison import (
     Explanation,
     FollowedUnit,
@@ -350,6 +351,13 @@ def _remarks(validity: Validity, updates: int, scatter: float, diverged: str | N
         "the recording has too few poses, so a filter followed the calibrated unit through it, which measures in rests "
         f"and where motion ends: {updates} updates."
     )
+    assert validity.history is not None
+    longest = float(np.diff(validity.history.time[validity.history.rest]).max(initial=0.0))
+    if longest > LONGEST_MOTION:
+        yield (
+            f"{longest:.0f} s of motion without a rest tell nothing of the gyroscope's scales: attitude cannot be "
+            "carried so far."
+        )
     if unknown := [shift.words for shift in validity.shifts if not shift.comparable]:
         names = ", ".join(unknown)
         yield f"not determined without poses, each by itself: {names}. Record twenty poses to compare them."

@@ -187,7 +187,7 @@ class Validity(Result, Document, page="validity"):
         """Say how far the gyroscope's bias is off, which is no fault of the calibration."""
         shift = np.array([moved.in_si for moved in self.shifts if moved.allowed], float)
         return (
-            f"gyroscope bias: {size(float(np.linalg.norm(shift)), 'rad/s', 2)} off the calibration's; it changes "
+            f"It is {size(float(np.linalg.norm(shift)), 'rad/s', 2)} off the calibration's; it changes "
             "at power-on; re-zero it at rest."
         )
 
@@ -197,7 +197,11 @@ class Validity(Result, Document, page="validity"):
         if self.verdict != "valid" and self.chi_squared <= self.freedom:
             ratio = f"p {probability(self.p_value)} in one direction, though noise is expected to scatter more in all"
         if self.verdict == "valid":
-            return f"The calibration is still valid: it predicts this recording to within its uncertainty ({ratio})."
+            told, all_numbers = sum(shift.comparable for shift in self.shifts), len(self.shifts)
+            shown = "" if told == all_numbers else f" in the {told} of {all_numbers} numbers that this recording shows"
+            return (
+                f"The calibration is still valid{shown}: it predicts the recording to within its uncertainty ({ratio})."
+            )
         if self.verdict == "unexplained" and self.history is not None:
             return (
                 f"The calibration does not predict this recording ({ratio}), and no change of its parameters would: it "
