@@ -15,11 +15,13 @@ from jaximu.data import forces_and_angles
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.tracing import padded_size
+from jaximu.ground.units import STANDARD_GRAVITY
+from jaximu.model import Noise, White
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import SegmentationOptions, observed_poses, rest_statistics, segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
-from jaximu.simulation.protocols import RateTable
+from jaximu.simulation.protocols import HandHeld, RateTable
 from jaximu.simulation.protocols.positions import directions
 
 HORIZONTAL, VERTICAL = np.array([1.0, 0.5, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -175,6 +177,41 @@ def test_too_short():
     log, _ = recording(10, poses=1, rest=0.3)
     with pytest.raises(NotPossibleError, match="too short"):
         segment(log)
+
+
+LOW_NOISE = {
+    "accelerometer": Noise((White(1e-3),), "specific_force"),
+    "gyroscope": Noise((White(8.7e-5),), "angular_rate"),
+}
+
+
+def calibrated_behind(name, numerator, denominator, seeds):
+    """Errors in sigmas of the gains' diagonals (n, 2, 3) where a filter acted on a sensor's samples."""
+    off = []
+    for seed in range(seeds):
+        unit = draw_imu(seed)
+        log, _ = simulate(unit, HandHeld(18, 3.0), LOW_NOISE, rate=100.0, seed=seed)
+        signal = log.signals[name]
+        late = scipy.signal.lfilter(numerator, denominator, signal.values - signal.values[0], axis=0) + signal.values[0]
+        one = calibrate(replace(log, **{name: replace(signal, values=late)}), LocalGravity(STANDARD_GRAVITY, 0.0))
+        gains = [
+            (np.diagonal(found.gain), np.diagonal(unit.triad(sensor).gain), np.diagonal(one.sigma(sensor)[0]))
+            for sensor, found in one.triads().items()
+        ]
+        off.append([(value - true) / sigma for value, true, sigma in gains])
+    return np.array(off)
+
+
+def test_what_a_lag_holds_back_belongs_to_the_turn():
+    """What dies away after a turn passes as still before it is gone: all scales were 1.3 sigmas too small."""
+    share = np.exp(-0.01 / 0.2)
+    off = calibrated_behind("gyroscope", [1 - share], [1, -share], 5)[:, 1]
+    assert off.mean() > -0.85 and np.sqrt(np.mean(off**2)) < 1.6
+
+
+def test_an_accelerometer_that_is_averaged_does_not_lead_the_gyroscope_astray():
+    off = calibrated_behind("accelerometer", np.full(50, 0.02), [1.0], 2)
+    assert np.sqrt(np.mean(off**2)) < 1.6
 
 
 @pytest.mark.parametrize("noise", [0.03, 0.1, 0.3, 1.0])

@@ -5,10 +5,12 @@ from __future__ import annotations
 import equinox as eqx
 import numpy as np
 
+from jaximu.data.poses import residual_rms
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.gravity import STANDARD
 from jaximu.model.sensor import Imu
 from jaximu.recordings.alignment import Turning, angle_of, rotation_of, signed_permutation, turning
+from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording
 
 _SAME = 0.2
@@ -31,12 +33,13 @@ def as_stated(recording: Recording, factors: FloatArray | float = 1.0) -> Imu:
     return Imu.nominal(*known)
 
 
-def nominal_imu(recording: Recording) -> Imu:
+def nominal_imu(recording: Recording, observations: Observations | None = None) -> Imu:
     """Return the unit as the recording's nominal scales and offsets describe it, where a fit starts.
 
     Axes or signs that are not what they should be, a stated gyroscope scale that is off by tens of percent (another
     range was set, or the factory corrected it) or a gyroscope mounted at an angle lead a fit over large turns into a
-    wrong minimum. Gravity turning in the accelerometer shows them to some percent: the fit starts from there.
+    wrong minimum. Gravity turning in the accelerometer shows them to some percent: the fit starts from there, unless
+    the poses and turns in `observations` are carried better as stated, as behind a filter of the accelerometer.
     """
     accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
     factors = _forces(recording)
@@ -52,7 +55,10 @@ def nominal_imu(recording: Recording) -> Imu:
     if np.array_equal(matrix, np.eye(3)):
         return imu
     gain = np.diag(gyroscope.nominal_scale) @ np.linalg.inv(matrix)
-    return eqx.tree_at(lambda unit: unit.gyroscope.gain, imu, gain)
+    shown = eqx.tree_at(lambda unit: unit.gyroscope.gain, imu, gain)
+    if observations is None or not observations.turns.mask.any():
+        return shown
+    return min((shown, imu), key=lambda unit: residual_rms(unit, observations)["gravity_direction"][0])
 
 
 def _forces(recording: Recording) -> FloatArray:

@@ -304,7 +304,7 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
         )
     noise = noise_of(static)
     observations = observed_poses(segmentations, gravity.value, noise=noise)
-    nominal = nominal_imu(recordings[0])
+    nominal = nominal_imu(recordings[0], observations)
     fitted = fit_hand_held(nominal, observations, method, loss)
     where = ", ".join(recording.name for recording in recordings)
     poses, turns = (int(part.mask.sum()) for part in (observations.poses, observations.turns))

@@ -163,7 +163,9 @@ def read_job(job: Job, settings: Settings) -> ReadJob:
         with prepared([recording], misfit=partial(carried_error, choices=choices)) as (ready,):
             segmentation = segment(ready.recording, settings.segmentation)
             observations = observed_poses(segmentation, settings.gravity.value, noise=noise)
-            unit = FleetUnit(observations, nominal_imu(ready.recording), ready.recording.gyroscope is not None)
+            unit = FleetUnit(
+                observations, nominal_imu(ready.recording, observations), ready.recording.gyroscope is not None
+            )
     except Exception as error:
         return ReadJob(row | _failure(error), None)
     of_noise = () if noise is None else noise.notes

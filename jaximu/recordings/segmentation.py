@@ -17,7 +17,7 @@ from jaximu.ground.quantities import counted
 from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.tracing import padded_size
 from jaximu.ground.units import INERTIAL_QUANTITIES, STANDARD_GRAVITY
-from jaximu.ground.vectors import lengths_of, variances_of
+from jaximu.ground.vectors import dot_rows, lengths_of, variances_of
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE
 from jaximu.recordings.observations import POWER_ON, Observations, Poses, SlowNoise, Turns
@@ -29,6 +29,7 @@ _PARTS = 4  # of a turn, over each of which slow bias is taken as constant
 _SHORTEST = 0.25  # s; what is correlated over less than this is white noise to poses and turns
 _ONSET = np.radians(100.0)  # rad/s³; the rate of a quarter turn in three seconds grows by so much times t² at first
 _CHANCE = 3.0  # standard deviations
+_SETTLED, _FEWEST_SETTLED = 4.0, 6  # standard deviations of a mean over poses, and poses, that show what dies away
 _SWINGS = np.radians(1.0)  # rad/s, rms of mean rates over windows; what lies still does less, and drifts less
 _TORN = 10.0  # times what the gyroscope shows, that gravity cannot turn by
 _BRIDGED = 3e-4  # rad; error that a gap may bring into a turn
@@ -217,9 +218,40 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
         raise NotPossibleError(
             f"{recording.name}: {_why_no_poses(results[chosen][0], centres[-1] - centres[0], means, notes)}"
         )
+    intervals = _settled(scan.moments, intervals, options.minimum_duration)
     tried = dict(zip(factors, counts, strict=True))
     torn, remarks = _torn(scan.moments, intervals)
     return Segmentation(recording, intervals, float(factors[chosen]), tried, (*notes, *remarks), torn)
+
+
+def _settled(moments: Sequence[Moments], intervals: FloatArray, shortest: float) -> FloatArray:
+    """Return poses (P, 2) without the beginnings in which a sensor's output still dies away, as behind a filter.
+
+    All poses together show it: a beginning is off the pose's second half against the way that the force turned, or
+    along the rate of the turn before, by more than the poses scatter. Twice as long is left out; a pose keeps
+    `shortest` seconds at least.
+    """
+    start, stop = intervals.T
+    width = max(shortest / 8, *(2 / running.signal.rate for running in moments))
+    late = [running.between((start + stop) / 2, stop)[0] for running in moments]
+    ways = [late[0][:-1] - late[0][1:]]
+    ways += [
+        running.between(stop[:-1], start[1:])[0] - np.median(rest, axis=0)
+        for running, rest in zip(moments[1:], late[1:], strict=True)
+    ]
+    cut = 0.0
+    while len(room := 1 + np.flatnonzero((stop - start)[1:] > 2 * (cut + width))) >= _FEWEST_SETTLED:
+        begins = start[room] + cut
+        parts = [running.between(begins, begins + width)[0] for running in moments]
+        off = [
+            dot_rows(part - rest[room], unit_vectors(way[room - 1]))
+            for part, rest, way in zip(parts, late, ways, strict=True)
+        ]
+        if max(np.mean(one) / max(np.std(one), 1e-9) for one in off) < _SETTLED / np.sqrt(len(room)):
+            break
+        cut += width
+    start[1:] += np.clip(2 * cut, 0.0, np.maximum(stop - start - shortest, 0.0))[1:]
+    return np.stack([start, stop], axis=1)
 
 
 def _torn(moments: Sequence[Moments], intervals: FloatArray) -> tuple[tuple[int, ...], tuple[str, ...]]:
