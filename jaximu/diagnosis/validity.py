@@ -197,10 +197,10 @@ class Validity(Result, Document, page="validity"):
         if self.verdict != "valid" and self.chi_squared <= self.freedom:
             ratio = f"p {probability(self.p_value)} in one direction, though noise is expected to scatter more in all"
         if self.verdict == "valid":
-            told, all_numbers = sum(shift.comparable for shift in self.shifts), len(self.shifts)
-            shown = "" if told == all_numbers else f" in the {told} of {all_numbers} numbers that this recording shows"
+            shown, count = sum(shift.comparable for shift in self.shifts), len(self.shifts)
+            scope = "" if shown == count else f" in the {shown} of {count} numbers that this recording shows"
             return (
-                f"The calibration is still valid{shown}: it predicts the recording to within its uncertainty ({ratio})."
+                f"The calibration is still valid{scope}: it predicts the recording to within its uncertainty ({ratio})."
             )
         if self.verdict == "unexplained" and self.history is not None:
             return (

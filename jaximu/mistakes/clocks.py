@@ -47,11 +47,11 @@ def find(samples: Samples) -> Iterator[Finding]:
         rivals = ("data.lost_samples",)
         yield Finding("data.clocks", (), text, "--repair", rivals, spoils=delay > _HARMFUL, apply=apply)
         return
-    late = clocks.offset > 0
+    delayed = clocks.offset > 0
     text = (
         f"gyroscope: its stamps are {1e3 * abs(clocks.offset):.3g} ± {1.96e3 * clocks.sigma:.2g} ms "
-        f"{'late' if late else 'early'} against the accelerometer's, or a filter delays "
-        f"{'it by as much (gyro.lag)' if late else 'the accelerometer by as much'}. --repair shifts them."
+        f"{'late' if delayed else 'early'} against the accelerometer's, or a filter delays "
+        f"{'it by as much (gyro.lag)' if delayed else 'the accelerometer by as much'}. --repair shifts them."
     )
-    rivals = ("gyro.lag",) if late else ()
+    rivals = ("gyro.lag",) if delayed else ()
     yield Finding("setup.time_offset", (), text, "--repair", rivals, spoils=delay > _HARMFUL, apply=apply)

@@ -233,11 +233,11 @@ def _settled(moments: Sequence[Moments], intervals: FloatArray, shortest: float)
     """
     start, stop = intervals.T
     width = max(shortest / 8, *(2 / running.signal.rate for running in moments))
-    late = [running.between((start + stop) / 2, stop)[0] for running in moments]
-    ways = [late[0][:-1] - late[0][1:]]
+    steady = [running.between((start + stop) / 2, stop)[0] for running in moments]
+    ways = [steady[0][:-1] - steady[0][1:]]
     ways += [
         running.between(stop[:-1], start[1:])[0] - np.median(rest, axis=0)
-        for running, rest in zip(moments[1:], late[1:], strict=True)
+        for running, rest in zip(moments[1:], steady[1:], strict=True)
     ]
     cut = 0.0
     while len(room := 1 + np.flatnonzero((stop - start)[1:] > 2 * (cut + width))) >= _FEWEST_SETTLED:
@@ -245,7 +245,7 @@ def _settled(moments: Sequence[Moments], intervals: FloatArray, shortest: float)
         parts = [running.between(begins, begins + width)[0] for running in moments]
         off = [
             dot_rows(part - rest[room], unit_vectors(way[room - 1]))
-            for part, rest, way in zip(parts, late, ways, strict=True)
+            for part, rest, way in zip(parts, steady, ways, strict=True)
         ]
         if max(np.mean(one) / max(np.std(one), 1e-9) for one in off) < _SETTLED / np.sqrt(len(room)):
             break
