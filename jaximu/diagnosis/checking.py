@@ -355,7 +355,7 @@ def _remarks(validity: Validity, updates: int, scatter: float, diverged: str | N
     longest = float(np.diff(validity.history.time[validity.history.rest]).max(initial=0.0))
     if longest > LONGEST_MOTION:
         yield (
-            f"{longest:.0f} s of motion without a rest tell nothing of the gyroscope's scales: attitude cannot be "
+            f"{longest:.0f} s of motion without a rest show nothing of the gyroscope's scales: attitude cannot be "
             "carried so far."
         )
     if unknown := [shift.words for shift in validity.shifts if not shift.comparable]:
