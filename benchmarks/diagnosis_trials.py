@@ -140,7 +140,7 @@ def trial(task):
                 "named": [each.name for each in said.effects],
                 "rivals": [list(each.rivals) for each in said.effects],
                 "preflight": [each.name for each in said.preflight],
-                "learned": None if said.learned is None else said.learned.effect.name,
+                "learned": next((curve.effect.name for curve in said.curves), None),
                 "p_value": said.p_value,
                 "text": " ".join(said.summary().verdict),
                 "notes": list(said.notes),

@@ -162,7 +162,7 @@ def main():
         sizes = {kind: size for kind, (size, _) in drift.sizes.items()}
         table.add(
             name, found.verdict, named, "; ".join(each.size() for each in found.named),
-            "" if found.learned is None else found.learned.covariate,
+            next((curve.covariate for curve in found.curves), ""),
             ", ".join(dict.fromkeys(each.name for each in found.preflight)),
             f"{sizes['accelerometer bias instability']:.2g}, {sizes['gyroscope bias instability']:.2g}",
             f"{sizes['poses that move']:.2g}", f"{sizes['turns undersampled']:.2g}", *shown, f"{found.unit:.2f}",

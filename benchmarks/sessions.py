@@ -111,7 +111,7 @@ def together(folder: Path, units: list[int], figures: dict) -> Table:
             shown = [f"{ratios[0]:.2f} → {ratios[1]:.2f}", f"{gain.log_likelihood:+.0f}"]
         (changes,) = [note for note in found.notes if "power is switched on" in note]
         table.add(unit, found.verdict, ", ".join(each.name for each in found.effects), *shown,
-                  "" if found.learned is None else found.learned.covariate,
+                  next((curve.covariate for curve in found.curves), ""),
                   changes.partition("about ")[2].partition(" (")[0])  # fmt: skip
         figures[f"unit {unit} together"] = {
             "verdict": found.verdict, "effects": [each.name for each in found.effects], "p_value": found.p_value,

@@ -186,15 +186,16 @@ def test_a_bias_that_drifts_along_a_hump_is_named(tmp_path):
     drifting = replace(recording, gyroscope=replace(gyroscope, values=gyroscope.values + hump[:, None] * amount))
     found = diagnose(drifting, GRAVITY, static=read_recording(files["static"]))
     assert (found.verdict, [cause.name for cause in found.named]) == ("effects", ["gyro.learned_time"])
-    assert found.gain.log_likelihood > 10 and found.learned.drift
+    (drift,) = found.drifts
+    assert found.gain.log_likelihood > 10 and found.learned is None
     # it is never used beyond the recording, and was predicted between poses; stretches stand beside that
     assert found.gain.data == "every 8th pose left out in turn"
-    assert found.gain.smaller([found.learned.effect]) and found.gain.otherwise.data == "8 parts left out in turn"
+    assert found.gain.smaller([drift.effect]) and found.gain.otherwise.data == "8 parts left out in turn"
     assert "bias drift along a curve" in found.summary().verdict[0]
-    truth = np.interp(found.learned.x, gyroscope.time - gyroscope.time[0], hump) * 2e-3
-    curve = found.learned.y[:, 1]
+    truth = np.interp(drift.x, gyroscope.time - gyroscope.time[0], hump) * 2e-3
+    curve = drift.y[:, 1]
     assert np.corrcoef(curve, truth)[0, 1] > 0.95
-    assert np.mean(np.abs(curve - truth - np.mean(curve - truth)) < found.learned.half_width[:, 1]) > 0.9
+    assert np.mean(np.abs(curve - truth - np.mean(curve - truth)) < drift.half_width[:, 1]) > 0.9
 
 
 @pytest.fixture(scope="module")

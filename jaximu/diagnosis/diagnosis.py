@@ -25,7 +25,7 @@ from jaximu.diagnosis.experiment import Experiment, KnownEffect, State
 from jaximu.diagnosis.extension import Extension, Found, extend, settled
 from jaximu.diagnosis.hidden import Hidden, hidden_causes
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
-from jaximu.diagnosis.learned import LearnedTerm, learn, left_out_likelihood, promising
+from jaximu.diagnosis.learned import LearnedTerm, drifts, learn, left_out, left_out_likelihood, promising
 from jaximu.diagnosis.lines import MovingLine, line_findings, moving_lines, swings_of
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise, usual_noise
 from jaximu.diagnosis.selection import Selection, select, shape_of, standing_out
@@ -33,7 +33,6 @@ from jaximu.estimation.data import Data
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.rows import ResidualKind, Sizes
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError, NotPossibleError, nearest
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
@@ -209,7 +208,8 @@ class Diagnosis(Result, Document, page="diagnosis"):
     with the noise model among them. p_value: family-wise, that nothing is missing. detection_limits: by effect, what
     could hide in this recording. not_observable: effects that it cannot show, and why. noise: put right where it was
     wrong. base, extended: the fits. unit: factor by which the noise looked too small. learned: where something stays
-    unexplained, a smooth term of what it depends on, which `extended` contains. options: recordings that would settle
+    unexplained, a smooth term of what it depends on, which `extended` contains. drifts: among `effects`, biases that
+    drift along curves. options: recordings that would settle
     a cause, where [`jaximu.planning.separation.advised`][] was asked. shape: where something stays unexplained, what
     it looks like if one shape without a cause describes it.
     """
@@ -231,9 +231,15 @@ class Diagnosis(Result, Document, page="diagnosis"):
     extended: State
     gain: Gain | None = None
     learned: LearnedTerm | None = None
+    drifts: tuple[LearnedTerm, ...] = ()
     options: tuple[Option, ...] = ()
     shape: str | None = None
     lines: tuple[MovingLine, ...] = ()
+
+    @property
+    def curves(self) -> tuple[LearnedTerm, ...]:
+        """All curves that the extended model contains, the one that explains most first."""
+        return self.drifts or (() if self.learned is None else (self.learned,))
 
     @property
     def named(self) -> tuple[Named, ...]:
@@ -261,7 +267,7 @@ class Diagnosis(Result, Document, page="diagnosis"):
                 {"record": option.text, "power": option.powers, "power_now": option.before} for option in self.options
             ],
             "noise_scale": self.unit,
-            "learned": None if self.learned is None else self.learned.document(),
+            "learned": next((curve.document() for curve in self.curves), None),
             "data": self.calibration.data,
             "software": SOFTWARE,
         }
@@ -279,13 +285,14 @@ class Diagnosis(Result, Document, page="diagnosis"):
         diagnosis = {
             "verdict": self.verdict,
             "effects": [effect.name for effect in self.effects],
-            "learned": None if self.learned is None else self.learned.effect.name,
+            "learned": next((curve.effect.name for curve in self.curves), None),
             "p_value": self.p_value,
             "suggestion": self.suggestion,
         }
         with_effects = extended(self.calibration, self.experiment, self.extended, self.noise)
         chosen = [effect.name for effect in self.extended.effects]
-        return replace(with_open_choice(with_effects, self.base, chosen), diagnosis=diagnosis)
+        base = self.drifts[0].state if self.drifts else self.base
+        return replace(with_open_choice(with_effects, base, chosen), diagnosis=diagnosis)
 
 
 def extended(calibration: Calibration, experiment: Experiment, state: State, noise: NoiseModel) -> Calibration:
@@ -296,15 +303,10 @@ def extended(calibration: Calibration, experiment: Experiment, state: State, noi
     """
     if not state.effects and not experiment.data.by_hand:
         return calibration
-    held = (
-        {}
-        if state.prior is None
-        else {name for name in state.names if name.effect is not None} - set(state.prior.names)
-    )
     fitted = fit(
         state.model,
         experiment,
-        lambda name: experiment.free(name) and name not in held,
+        experiment.freed(state.prior),
         prior=state.prior,
         excess=np.zeros(len(experiment.coarse)),
     )
@@ -696,6 +698,7 @@ class _Course:
     chosen: bool = False
     gain: Gain | None = None
     learned: LearnedTerm | None = None
+    drifts: tuple[LearnedTerm, ...] = ()
     shape: str | None = None
 
     def __post_init__(self):
@@ -794,27 +797,28 @@ class _Course:
             # what was named in part was a guess at the same misfit, or the curve is of what it leaves
             guessed = one_curve or predicted <= candidate.log_likelihood + _GUESSED
             candidate = candidate if guessed else beside
-        learned = candidate and learn(experiment, candidate, self.other, self.examination.level)
-        if imitated and learned and not (learned.drift and imitated[0].curved in learned.effect.needs):
-            learned = None
+        level = self.examination.level
+        learned = candidate and learn(experiment, candidate, self.other, level)
+        drifting, beside = drifts(experiment, learned, level) if learned else ((), None)
+        if imitated and learned and not (drifting and imitated[0].curved in learned.effect.needs):
+            learned, drifting, beside = None, (), None
         if guessed and learned:
             self._settle(found=[])
-        if learned is not None and learned.drift:
-            self._drifts(learned)
+        if beside is not None:
+            self._drifts(drifting, beside)
         elif learned is not None:
+            self.learned = learned
             self._settle(state=learned.state)
         elif shape is not None:
             self.shape = shape[0].words
-        self.learned = learned
 
-    def _drifts(self, curve: LearnedTerm) -> None:
-        """Take a curve over the time of the recording for what it is, drift of a bias, beside what stands."""
-        without = self.extension.state if self.extension.found else self.extension.base
-        before, after = (float(np.sum(one.evidence.residual**2)) for one in (without, curve.state))
-        size = curve.effect.size
-        drift = Found(curve.effect.name, (), float(chi2_sf(before - after, size)), before - after, size)
-        self._settle(found=[*self.extension.found, drift], state=curve.state, complete=True)
-        self.gain = curve.gain
+    def _drifts(self, curves: Sequence[LearnedTerm], beside: Extension) -> None:
+        """Take curves over the time of recordings for what they are, drift of biases, and the causes beside them."""
+        causes = [Found(curve.effect.name, (), *curve.evidence) for curve in curves]
+        found = [*self.extension.found, *causes, *beside.found]
+        self._settle(found=found, state=beside.state, complete=True)
+        gain, otherwise = (left_out(beside.experiment, self.extension.base, beside.state, way) for way in (True, False))
+        self.drifts, self.gain = tuple(curves), replace(gain, otherwise=otherwise if otherwise.before.count else None)
 
     def _names(self) -> str:
         return ", ".join(effect_title(entry.name) for entry in self.extension.found)
@@ -862,6 +866,7 @@ class _Course:
             extension.state,
             self.gain,
             self.learned,
+            self.drifts,
             shape=self.shape,
         )
 

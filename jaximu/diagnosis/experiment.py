@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from jaximu.diagnosis.evidence import EffectBlock, Evidence
 from jaximu.diagnosis.shapes import imitated_shapes, shapes_without_cause
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.fitting import Linear, Prior, effect_numbers, fit, linearise
-from jaximu.estimation.problem import Name
+from jaximu.estimation.problem import Name, flatten, names_of
 from jaximu.estimation.rows import Fold, Rows, Sizes
 from jaximu.estimation.track import added
 from jaximu.ground.array_types import Array, BoolArray, FloatArray
@@ -86,6 +86,17 @@ class State:
     def effects(self) -> tuple[Effect, ...]:
         """The effects that were fitted."""
         return tuple(self.model.all_effects().values())
+
+    @property
+    def informed(self) -> tuple[FloatArray, FloatArray]:
+        """Whitened columns (n + k, p) and conditions (n + k,): below the data's those of the k numbers of the prior."""
+        columns, conditions = self.evidence.jacobian, self.weights @ self.conditions
+        if self.prior is None:
+            return columns, conditions
+        names, values = names_of(self.model), np.asarray(flatten(self.model))
+        known = values[[names.index(name) for name in self.prior.names]] - self.prior.mean
+        rows = self.prior.rows([self.names[k] for k in self.fitted], self.fitted_sizes)
+        return np.concatenate([columns, rows]), np.concatenate([conditions, self.prior.root @ known])
 
     def places(self, name: str, part: str = "coefficients") -> list[int]:
         """Return the places of a fitted effect's coefficients, or of an inner parameter, among the numbers."""
@@ -159,6 +170,11 @@ class Experiment(Data):
     def free(self, name: Name) -> bool:
         """Return whether a number is free."""
         return self.data.free(name)
+
+    def freed(self, prior: Prior | None) -> Callable[[Name], bool]:
+        """Return which numbers are free beside a prior of effects: their inner parameters are held."""
+        held = set() if prior is None else {(name.owner, name.effect) for name in prior.names}
+        return lambda name: self.free(name) and (name.part == "coefficients" or (name.owner, name.effect) not in held)
 
     def reactions(self, details: Any):
         """Return how the conditions react to effects."""
@@ -347,17 +363,18 @@ class Experiment(Data):
     ) -> State:
         """Fit gain, bias and the effects, each starting where it is given, and ask what else may be there.
 
-        With a prior the effects' inner parameters are held. `asking`: of the effects of these names alone, without
+        Those of the prior keep their inner parameters. `asking`: of the effects of these names alone, without
         their triads. Raises `NotPossibleError` where the fit comes to nothing that a unit can be.
         """
         start = (self.start if imu is None else imu).with_effects(*effects)
-
-        def free(name: Name) -> bool:
-            held = prior is not None and name.effect is not None and name.part != "coefficients"
-            return self.free(name) and not held
-
         fitted = fit(
-            start, self, free, prior=prior, excess=np.zeros(len(self.coarse)), estimate_excess=False, max_passes=16
+            start,
+            self,
+            self.freed(prior),
+            prior=prior,
+            excess=np.zeros(len(self.coarse)),
+            estimate_excess=False,
+            max_passes=16,
         )
         if not bool(fitted.finite):
             names = " and ".join(effect.name for effect in effects) or "gain and bias"

@@ -13,10 +13,10 @@ from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.improvement import on_held_out
 from jaximu.diagnosis.selection import (
     BESIDE,
-    MOST,
     SelectedCause,
     Selection,
     causes_of,
+    most,
     one_curve,
     select,
     strength_needed,
@@ -24,6 +24,7 @@ from jaximu.diagnosis.selection import (
 from jaximu.ground.errors import NotPossibleError
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect
+from jaximu.model.sensor import Imu
 from jaximu.recordings.finding import Finding
 
 _DECISIVE = 5.0
@@ -73,21 +74,27 @@ def extend(
 ) -> Extension:
     """Take causes into the model, refit and ask again, until nothing is missing or nothing more can be named.
 
-    `taken`: effects that another selection has chosen; they are in the model from the start, and stay.
+    **Arguments:** `base`: a fit, whose effects stay in the model. `selection`: of what it lacks. `taken`: effects that
+    another selection has chosen; they are in the model from the start, and stay.
     """
     entries: list[Found] = []
     state, poses = base, []
+
+    def fitted(among: Iterable[Effect], imu: Imu) -> State:
+        names = {effect.name for effect in base.effects} | {entry.name for entry in entries}
+        return experiment.fit([effect for effect in among if effect.name in names], imu, base.prior)
+
     causes = causes_of(base.evidence, [effect.name for effect in taken]) if selection.causes or taken else []
     if causes and not selection.explained:
         blocks = base.evidence.blocks
         entries = [_named(blocks, cause) for cause in causes]
-        state = experiment.fit(_those_found(taken, entries), base.imu)
+        state = fitted((*base.effects, *taken), base.imu)
         selection = select(state.evidence, level / 100)
     chosen = len(entries)
     guessed = False  # a cause was taken in that did not explain the misfit
     while selection.causes:
         guessed |= not selection.complete
-        if len(entries) - chosen + len(poses) + len(selection.causes) > MOST:
+        if len(entries) - chosen + len(poses) + len(selection.causes) > most(base.evidence):
             break
         effects, blocks = list(state.effects), state.evidence.blocks
         coefficients, _ = state.evidence.most_likely([cause.block for cause in selection.causes])
@@ -104,11 +111,12 @@ def extend(
             poses.append(_bumped(experiment, pose))
             experiment = experiment.without(pose)
         if bumped:
-            base = experiment.fit()
+            base = experiment.fit(base.effects, base.imu, base.prior)
         try:
-            state = experiment.fit(effects, state.imu) if effects else base
+            state = fitted(effects, state.imu) if entries else base
         except NotPossibleError:  # what looks like these effects to first order is none of them
-            state, entries = experiment.fit(state.effects, base.imu) if bumped else state, entries[:before]
+            entries = entries[:before]
+            state = fitted(state.effects, base.imu) if bumped else state
             break
         # what is found once all was explained is mostly chance, or a shape that the refit did not quite meet
         selection = select(state.evidence, level if guessed else level / 100)
@@ -121,12 +129,12 @@ def extend(
         complete = False  # a curve of one input that is in no catalogue, imitated by two that are
         strongest = max(entries[chosen:], key=lambda entry: entry.statistic)
         entries = [*entries[:chosen], strongest]
-        state = experiment.fit(_those_found(state.effects, entries), base.imu)
+        state = fitted(state.effects, base.imu)
     imitating = _imitating(base.evidence, entries[chosen:], chosen_causes) if guessed else []
     if imitating and len(entries) > 1:
         complete = False
         entries = [entry for entry in entries if entry not in imitating]
-        state = experiment.fit(_those_found(state.effects, entries), base.imu)
+        state = fitted(state.effects, base.imu)
     return Extension(entries, state, experiment, base, complete, poses, beside)
 
 
@@ -139,11 +147,6 @@ def _imitating(evidence: Evidence, entries: Sequence[Found], causes: Sequence[Se
         return entry.name in blocks and entry.times > strength_needed(evidence, blocks[entry.name], others)
 
     return [entry for entry in entries if not stands(entry)]
-
-
-def _those_found(effects: Iterable[Effect], entries: Sequence[Found]) -> list[Effect]:
-    names = {entry.name for entry in entries}
-    return [effect for effect in effects if effect.name in names]
 
 
 def settled(extension: Extension, held: Experiment) -> tuple[Extension, list[str]]:

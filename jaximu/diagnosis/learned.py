@@ -17,14 +17,17 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from jaximu.diagnosis.experiment import LEAST_WARMING, Experiment, State
+from jaximu.diagnosis.extension import Extension, extend
 from jaximu.diagnosis.improvement import Gain, Prediction, on_held_out, parts_left_out
 from jaximu.diagnosis.selection import LEVEL, select
 from jaximu.estimation.fitting import Prior
 from jaximu.estimation.leave_out import LeftOut, further, leave_out, orthonormal
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import BoolArray, FloatArray
+from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.document import Json
 from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.quantities import Z95
 from jaximu.ground.vectors import submatrix
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import Learned as Curve
@@ -44,8 +47,7 @@ class LearnedTerm:
     effect: the curve. gain: on data that was not fitted; where that is parts of the recording left out, the noise of
     either model is widened to fit what was left out, if it looks too small. x (101,): the covariate, in its unit; y
     (101, 3): what the axes of the triad put out by it, SI; half_width (101, 3): of its 95 % band. state: the fit with
-    the curve in it. drift: whether it is a cause: the curve belongs to the recording, makes errors left out smaller,
-    and leaves nothing unexplained.
+    the curve in it. statistic: by which χ² falls.
     """
 
     effect: Curve
@@ -54,7 +56,17 @@ class LearnedTerm:
     y: FloatArray
     half_width: FloatArray
     state: State
-    drift: bool = False
+    statistic: float
+
+    @property
+    def evidence(self) -> tuple[float, float, int]:
+        """The p-value of its absence, its statistic and its degrees of freedom."""
+        return float(chi2_sf(self.statistic, self.effect.size)), self.statistic, self.effect.size
+
+    @property
+    def of_recording(self) -> bool:
+        """Whether it belongs to the recording, and makes errors left out smaller."""
+        return self.effect.scope == "session" and self.gain.smaller([self.effect])
 
     @property
     def covariate(self) -> str:
@@ -140,11 +152,38 @@ def learn(
         gain = on_held_out(held, candidate.state, fitted)
         if gain.log_likelihood <= 0:
             return None
-    before, after = (select(fit.evidence, level).explained for fit in (candidate.state, fitted))
-    drift = effect.scope == "session" and gain.smaller([effect]) and after and not before
-    if candidate.gain.log_likelihood < _PAYS and not drift:
-        return None
-    return LearnedTerm(curve_of(fitted), gain, *_curve(fitted), fitted, drift)
+    before, after = (float(np.sum(fit.evidence.residual**2)) for fit in (candidate.state, fitted))
+    term = _term(fitted, effect.name, gain, before - after)
+    if candidate.gain.log_likelihood >= _PAYS:
+        return term
+    explained = [select(fit.evidence, level).explained for fit in (candidate.state, fitted)]
+    return term if term.of_recording and explained == [False, True] else None
+
+
+def drifts(
+    experiment: Experiment, first: LearnedTerm, level: float = LEVEL
+) -> tuple[tuple[LearnedTerm, ...], Extension | None]:
+    """Return curves over time, each of a sensor in a recording, and the extension of a fit with them by causes.
+
+    Together they leave nothing unexplained. Where none do there are no curves, and no extension. A cause beside them
+    must predict better what is left out.
+
+    **Arguments:** `first`: the curve that explains most; `level`: of what all leave.
+    """
+    terms = [first]
+    while terms[-1].of_recording:
+        state = terms[-1].state
+        selection = select(state.evidence, level)
+        extension = extend(experiment, state, selection, level) if selection.complete else None
+        if extension and extension.complete and not extension.findings:
+            if not extension.found or left_out(experiment, state, extension.state, True).log_likelihood > 0:
+                return tuple(_term(state, term.effect.name, term.gain, term.statistic) for term in terms), extension
+        candidate = promising(experiment, state)
+        term = candidate and learn(experiment, candidate, None, level)
+        if term is None:
+            break
+        terms.append(term)
+    return (), None
 
 
 def _best(experiment: Experiment, state: State, interleaved: bool) -> PromisingCurve | None:
@@ -181,13 +220,13 @@ def left_out_likelihood(experiment: Experiment, state: State) -> float:
     return _Parts.of(experiment, False, state)[0].plain.log_likelihood
 
 
-def left_out(experiment: Experiment, before: State, after: State) -> Gain:
+def left_out(experiment: Experiment, before: State, after: State, interleaved: bool = False) -> Gain:
     """Return what one fit gains over another where the experiment's parts are left out in turn.
 
     Only the numbers are fitted without a part; the effects, and their inner parameters, were chosen with all of it.
     """
-    one, other = _Parts.of(experiment, False, before, after)
-    return Gain(one.plain, other.plain, parts_left_out(len(one.parts), experiment.real, False))
+    one, other = _Parts.of(experiment, interleaved, before, after)
+    return Gain(one.plain, other.plain, parts_left_out(len(one.parts), experiment.real, interleaved))
 
 
 def curves(experiment: Experiment, state: State) -> Iterator[tuple[Curve, FloatArray, FloatArray]]:
@@ -196,10 +235,10 @@ def curves(experiment: Experiment, state: State) -> Iterator[tuple[Curve, FloatA
     Columns (n, q) are whitened and those of coefficients that are a priori of variance one; the roots (q,) are these
     coefficients' unit.
     """
-    warming = experiment.extent().temperature_range
+    warming, inside = experiment.extent().temperature_range, {effect.name for effect in state.effects}
     effects = []
     for kind in (one for whole in CATALOGUE.values() for one in experiment.by_recording(whole)):
-        if not issubclass(kind, Curve) or kind.owner not in state.imu.triads():
+        if not issubclass(kind, Curve) or kind.owner not in state.imu.triads() or kind.name in inside:
             continue
         if experiment.lacking(kind, state.linear):
             continue
@@ -239,27 +278,29 @@ def _spanned(experiment: Experiment, kind: type[Curve], state: State) -> Curve |
 class _Parts:
     """Parts of a recording left out in turn, about a fit: whatever does not depend on a curve, computed once.
 
-    basis: orthonormal, of the fit's columns. parts: rows left out together as the rest predicts them, and which of them
-    count.
+    basis: orthonormal, of the fit's columns; target: its whitened conditions; both with what is known beforehand.
+    parts: rows left out together as the rest predicts them, and which of them count.
     """
 
     experiment: Experiment
     state: State
     basis: FloatArray
+    target: FloatArray
     parts: list[tuple[LeftOut, BoolArray]]
 
     @classmethod
     def of(cls, experiment: Experiment, interleaved: bool, *states: State) -> list[_Parts]:
         """Return the parts that all fits predict from the others: the rest are no comparison."""
         folds = experiment.folds(_PARTS, interleaved)
+        problems = [state.informed for state in states]
         fits = [
-            list(leave_out(fit.weights, fit.evidence.jacobian, fit.evidence.residual, [rows for rows, _ in folds]))
-            for fit in states
+            list(leave_out(state.weights, *problem, [rows for rows, _ in folds]))
+            for state, problem in zip(states, problems, strict=True)
         ]
         predicted = [k for k in range(len(folds)) if not any(parts[k].blind for parts in fits)]
         return [
-            cls(experiment, fit, orthonormal(fit.evidence.jacobian), [(parts[k], folds[k][1]) for k in predicted])
-            for fit, parts in zip(states, fits, strict=True)
+            cls(experiment, state, orthonormal(columns), target, [(parts[k], folds[k][1]) for k in predicted])
+            for state, (columns, target), parts in zip(states, problems, fits, strict=True)
         ]
 
     @cached_property
@@ -269,9 +310,9 @@ class _Parts:
 
     def with_curve(self, columns: FloatArray) -> Prediction:
         """Predict the parts beside columns (n, q) of numbers that are a priori of variance one."""
-        evidence, squared, count, volume = self.state.evidence, 0.0, 0, 0.0
-        pull, step = further(self.state.weights, self.basis, evidence.residual, columns)
-        errors = np.zeros(len(evidence.residual))
+        squared, count, volume = 0.0, 0, 0.0
+        pull, step = further(self.state.weights, self.basis, self.target, columns)
+        errors = np.zeros(len(columns))
         for part, scored in self.parts:
             error, covariance = part.beside(pull[part.rows], step)
             root = np.linalg.cholesky(submatrix(covariance, scored))
@@ -292,17 +333,14 @@ def _fitted(experiment: Experiment, candidate: PromisingCurve) -> State:
     owned = state.imu.with_effects(*effects).all_effects()
     ((owner, index),) = (key for key, fitted in owned.items() if fitted.name == effect.name)
     names = tuple(Name(owner, "coefficients", (k,), index) for k in range(effect.size))
-    return experiment.fit(effects, state.imu, Prior(names, np.zeros(effect.size), np.diag(1 / candidate.spread)))
+    prior = Prior(names, np.zeros(effect.size), np.diag(1 / candidate.spread))
+    return experiment.fit(effects, state.imu, Prior.joined(state.prior, prior))
 
 
-def curve_of(state: State) -> Curve:
-    """Return the curve that was taken into a fit."""
-    return next(effect for effect in state.effects if isinstance(effect, Curve))
-
-
-def _curve(state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the covariate (101,), the curve (101, 3), SI, and half the width of its 95 % band."""
-    effect = curve_of(state)
+def _term(state: State, name: str, gain: Gain, statistic: float) -> LearnedTerm:
+    """Return the curve of this name as it is fitted."""
+    effect = next(effect for effect in state.effects if effect.name == name)
+    assert isinstance(effect, Curve)
     scale = state.imu.triads()[effect.owner].scales
     low, high = map(float, effect.interval())
     x = np.linspace(low, high, _POINTS)
@@ -313,4 +351,4 @@ def _curve(state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
     y = shapes @ np.asarray(effect.coefficients).reshape(3, count).T / scale
     blocks = [known[a : a + count, a : a + count] for a in range(0, 3 * count, count)]
     sigma = np.sqrt(np.stack([np.einsum("xk,kl,xl->x", shapes, block, shapes) for block in blocks], axis=1))
-    return x, y, 1.96 * sigma / scale
+    return LearnedTerm(effect, gain, x, y, Z95 * sigma / scale, state, statistic)

@@ -108,12 +108,14 @@ def further(
 ) -> tuple[FloatArray, FloatArray]:
     """Return how numbers that are a priori normal, of variance one, pull at rows (n, q), and their steps (q,).
 
-    **Arguments:** `weights`, `target`: of `leave_out`. `basis` (n, k): orthonormal, of its columns. `columns` (n, q):
-    whitened, of the further numbers. Q becomes Q − pull pullᵀ, and Q y becomes Q y − pull · step.
+    **Arguments:** `weights`, `target` (n + k,): of `leave_out`. `basis` (n + k, r): orthonormal, of its columns.
+    `columns` (n, q): whitened, of the further numbers. Q becomes Q − pull pullᵀ, and Q y becomes Q y − pull · step.
     """
+    count, numbers = columns.shape
+    columns = np.concatenate([columns, np.zeros((len(target) - count, numbers))])
     free = off(basis, columns)
-    scaled = solve_triangular(np.linalg.cholesky(np.eye(columns.shape[1]) + columns.T @ free), free.T, lower=True)
-    return weights.T @ scaled.T, scaled @ target
+    scaled = solve_triangular(np.linalg.cholesky(np.eye(numbers) + columns.T @ free), free.T, lower=True)
+    return weights.T @ scaled[:, :count].T, scaled @ target
 
 
 def orthonormal(columns: FloatArray) -> FloatArray:

@@ -291,34 +291,32 @@ def _lines_figure(diagnosis: Diagnosis) -> Figure:
 
 
 def _learned_part(diagnosis: Diagnosis) -> Iterator[Section]:
-    learned = diagnosis.learned
-    if learned is None:
-        return
-    name = learned.effect.name
-    yield Section(
-        "How the bias drifts" if learned.drift else "What the misfit depends on",
-        [
-            f"The {learned.triad}'s bias drifts by more than its noise. The extended model has the drift as a curve "
-            f"({name}). It belongs to this recording, and `jaximu compensate` leaves it alone."
-            if learned.drift
-            else f"No known effect explains it, but the {learned.triad}'s misfit depends on {learned.covariate}: a "
-            f"smooth curve ({name}) follows it, and the extended calibration contains the curve.",
-            Picture(
-                "learned",
-                partial(_learned, learned),
-                "The smooth curve that the misfit follows, with its band",
-                f"What the {learned.triad} puts out by {learned.covariate}, learned from the recording without a "
-                "cause, with its 95 % band; a constant is part of the bias. Beyond its ends the extended calibration "
-                "keeps the curve constant.",
-            ),
-        ],
-    )
+    for place, curve in enumerate(diagnosis.curves, 1):
+        name, drift = curve.effect.name, bool(diagnosis.drifts)
+        yield Section(
+            "How the bias drifts" if drift else "What the misfit depends on",
+            [
+                f"The {curve.triad}'s bias drifts by more than its noise. The extended model has the drift as a curve "
+                f"({name}). It belongs to this recording, and `jaximu compensate` leaves it alone."
+                if drift
+                else f"No known effect explains it, but the {curve.triad}'s misfit depends on {curve.covariate}: a "
+                f"smooth curve ({name}) follows it, and the extended calibration contains the curve.",
+                Picture(
+                    "learned" if place == 1 else f"learned_{place}",
+                    partial(_learned, curve),
+                    "The smooth curve that the misfit follows, with its band",
+                    f"What the {curve.triad} puts out by {curve.covariate}, learned from the recording without a "
+                    "cause, with its 95 % band; a constant is part of the bias. Beyond its ends the extended "
+                    "calibration keeps the curve constant.",
+                ),
+            ],
+        )
 
 
 def _gains(diagnosis: Diagnosis) -> Iterator[Table]:
     if diagnosis.gain is not None:
         yield _gain_table(diagnosis, "extended model", diagnosis.gain)
-    if diagnosis.learned is not None and not diagnosis.learned.drift:
+    if diagnosis.learned is not None:
         yield _gain_table(diagnosis, "with the smooth curve", diagnosis.learned.gain)
 
 
@@ -360,7 +358,7 @@ def _cost(diagnosis: Diagnosis) -> Iterator[Statement]:
         for effect in diagnosis.named
     ]
     learned = diagnosis.learned
-    if learned is not None and not learned.drift:
+    if learned is not None:
         peak = np.unravel_index(np.abs(learned.y).argmax(), learned.y.shape)
         swing = with_interval(abs(learned.y[peak]), learned.half_width[peak] / Z95, SENSOR_UNITS[learned.triad])
         outputs.append(f"{learned.covariate} changes the {learned.triad}'s output by up to {swing} (95 %)")
