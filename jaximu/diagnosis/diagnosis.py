@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -699,6 +699,7 @@ class _Course:
     gain: Gain | None = None
     learned: LearnedTerm | None = None
     drifts: tuple[LearnedTerm, ...] = ()
+    strange: Mapping[str, float] = field(default_factory=dict)
     shape: str | None = None
 
     def __post_init__(self):
@@ -726,10 +727,11 @@ class _Course:
         if self.extension.beside:
             beyond = self.extension.beside
             self.notes.append(f"{self._names()} looks like the cause and is not all of it: beyond it {beyond}.")
-        strange = [] if self.experiment.drift is None else self.experiment.drift.implausible
-        if strange and not self.extension.found:  # what an effect leaves to second order was in the drift until then
-            self._settle(complete=False)
-            self.notes += strange
+        drift = self.experiment.drift
+        if drift is not None and not self.extension.found:  # what an effect leaves to second order was in it until then
+            self.strange = drift.implausible
+            self._settle(complete=self.extension.complete and not self.strange)
+            self.notes += self.strange
 
     def confirm(self) -> None:
         """Measure the gain on what was not fitted; what gains nothing is not kept."""
@@ -852,7 +854,7 @@ class _Course:
             verdict,
             effects,
             tuple(findings),
-            min([self.first.p_value, *(noise.p_value for noise in noises)]),
+            min([self.first.p_value, *(noise.p_value for noise in noises), *self.strange.values()]),
             self.first.scores.unit,
             extension.base.limits,
             dict(sorted(blind.items())),

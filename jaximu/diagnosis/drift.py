@@ -25,6 +25,7 @@ from jaximu.estimation.data import Data, Handling
 from jaximu.estimation.fitting import Linear
 from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.ground.array_types import BoolArray, FloatArray
+from jaximu.ground.distributions import normal_sf
 from jaximu.ground.vectors import sigmas_of, submatrix
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
@@ -32,8 +33,8 @@ from jaximu.model.sensor import Imu
 _USUAL = {**USUAL_DRIFT, "poses that move": (1.0, 0.5), "turns undersampled": (0.1, 1.0)}
 """Median of each kind's standard deviation and the spread of its logarithm. What hands do is relative to what the
 samples show, which for poses is all, and for turns holds at half the sample rate."""
-_STRANGE = 3.0
-"""Spreads beyond the usual from which on a size is not believed."""
+_STRANGE = 0.01
+"""Share of sensors, or hands, that have a size beyond which it is not believed."""
 DRAWS = 1000
 """Draws of noise that the law of the smallest p-value comes from."""
 
@@ -65,15 +66,18 @@ class DriftComponents:
         }
 
     @property
-    def implausible(self) -> list[str]:
-        """What no sensor or hand of this class does, in sentences: such sizes stand for a misfit of another kind."""
-        sentences = []
+    def implausible(self) -> dict[str, float]:
+        """What hardly any sensor or hand does, in sentences, and how probable: such sizes stand for another misfit."""
+        sentences = {}
         for name, (size, _) in self.sizes.items():
             median, spread = next(usual for kind, usual in _USUAL.items() if name.endswith(kind))
-            if np.log(size / median) > _STRANGE * spread:
-                sentences.append(
-                    f"To explain the misfit, the size of {name} would have to be {size:.3g}, where {median:g} is "
-                    "usual: the cause is another."
+            probability = float(normal_sf(np.log(size / median) / spread))
+            if probability < _STRANGE:
+                text = (
+                    f"To explain the misfit, the size of {name} would have to be {size:.3g}, where {median:g} is usual"
+                )
+                sentences[f"{text}, and not one in {1 / _STRANGE:.0f} is as large: another cause is likelier."] = (
+                    probability
                 )
         return sentences
 

@@ -22,6 +22,7 @@ from jaximu.estimation.problem import Name, flatten, names_of
 from jaximu.estimation.rows import Fold, Rows, Sizes
 from jaximu.estimation.track import added
 from jaximu.ground.array_types import Array, BoolArray, FloatArray
+from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.document import Json
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.vectors import submatrix
@@ -104,6 +105,13 @@ class State:
         return [
             k for k, number in enumerate(self.names) if (number.owner, number.effect) == key and number.part == part
         ]
+
+    def differs(self, name: str, level: float) -> bool:
+        """Return whether a fitted effect's coefficients differ from zero, together."""
+        (effect,) = (effect for effect in self.effects if effect.name == name)
+        places, values = self.places(name), np.asarray(effect.coefficients)
+        known = np.linalg.pinv(submatrix(self.covariance, places), hermitian=True)
+        return float(chi2_sf(float(values @ known @ values), len(places))) < level
 
 
 class KnownEffect(NamedTuple):

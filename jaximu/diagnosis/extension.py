@@ -130,6 +130,12 @@ def extend(
         strongest = max(entries[chosen:], key=lambda entry: entry.statistic)
         entries = [*entries[:chosen], strongest]
         state = fitted(state.effects, base.imu)
+    for entry in sorted(entries[chosen:], key=lambda entry: entry.statistic) if complete else ():
+        if len(entries) > 1 and not state.differs(entry.name, level):
+            entries.remove(entry)
+            without = fitted(state.effects, state.imu)
+            needed = not select(without.evidence, level).explained
+            entries, state = ([*entries, entry], state) if needed else (entries, without)
     imitating = _imitating(base.evidence, entries[chosen:], chosen_causes) if guessed else []
     if imitating and len(entries) > 1:
         complete = False

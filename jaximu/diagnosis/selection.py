@@ -138,6 +138,8 @@ def shape_of(evidence: Evidence, level: float = LEVEL) -> tuple[EffectBlock, flo
     while generic and len(chosen) < 2:
         chosen.append(min(generic, key=lambda k: p_value[k]))
         left = evidence.scores(chosen)
+        if len(chosen) == 1 and evidence.family_wise(float(p_value[chosen[0]])) >= level:
+            return None
         if evidence.family_wise(left.smallest) >= BESIDE * level:
             return evidence.blocks[chosen[0]], criterion(evidence, alone, chosen[0]) / 2
         name, p_value = evidence.blocks[chosen[0]].name, left.p_value
