@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from jaximu.diagnosis.drift import DriftComponents
-from jaximu.diagnosis.evidence import EffectBlock, Evidence
+from jaximu.diagnosis.evidence import FAMILY_LEVEL, EffectBlock, Evidence
 from jaximu.diagnosis.shapes import imitated_shapes, shapes_without_cause
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.fitting import Linear, Prior, effect_numbers, fit, linearise
@@ -404,7 +404,12 @@ class Experiment(Data):
             noise = self.drift.draws(weights, jacobian, used, _SEED)
         whole = Evidence(weights @ linear.conditions[used], jacobian, blocks)
         limits = _limits(whole, model)
-        visible = [b for b in blocks if b.kind != "effect" or limits[b.name][0] < _PLAUSIBLE * np.max(b.sizes)]
+        clear = whole.scores().p_value * len(blocks) < FAMILY_LEVEL  # is shown, however little of it is
+        visible = [
+            block
+            for block, stands in zip(blocks, clear, strict=True)
+            if block.kind != "effect" or stands or limits[block.name][0] < _PLAUSIBLE * np.max(block.sizes)
+        ]
         for name in sorted({block.name for block in blocks} - {block.name for block in visible}):
             blind[name] = (
                 "bias, scale and misalignment imitate it here, or nothing excites it; it needs "

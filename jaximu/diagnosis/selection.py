@@ -20,8 +20,8 @@ _DEFECT = 10.0
 """What a defect of the recording must lead by, which would be cut out, against an effect that explains as much."""
 _STRONG, _SEPARATE = 2.0, 1.0
 """Detection limits that each of several must have beside the others: weak ones imitate what is outside the catalogue.
-Fewer will do for the only one of its sensor, whose conditions hardly share any with the others': nothing imitates both
-at once."""
+Fewer will do for the only one of its sensor, or of its recording, whose conditions hardly share any with the others':
+nothing imitates both at once."""
 _SHARED, _ALIKE = 0.1, 0.5
 """Share of one effect's conditions that another may make to be separate from it; and share of its statistic beyond
 which two curves of one input are one curve that the catalogue lacks: each mends what the other is wrong by."""
@@ -226,12 +226,19 @@ def one_curve(evidence: Evidence, one: int, other: int) -> bool:
 
 def strength_needed(evidence: Evidence, block: int, others: Sequence[int]) -> float:
     """Return the detection limits that a cause must have beside others for them not to imitate what has no name."""
-    triad = evidence.blocks[block].name.partition(".")[0]
+    mine = _acting(evidence, block)
     separate = all(
-        evidence.blocks[other].name.partition(".")[0] != triad and evidence.shared(block, other) < _SHARED
-        for other in others
+        any(one and other and one != other for one, other in zip(mine, _acting(evidence, k), strict=True))
+        and evidence.shared(block, k) < _SHARED
+        for k in others
     )
     return _SEPARATE if separate else _STRONG
+
+
+def _acting(evidence: Evidence, block: int) -> tuple[str, int]:
+    """Return the sensor that a block acts on, and the recording in which it acts alone, or 0."""
+    name = evidence.blocks[block].name
+    return name.partition(".")[0], CATALOGUE[name].recording if name in CATALOGUE else 0
 
 
 def _taken(evidence: Evidence, one: int, other: int) -> float:
