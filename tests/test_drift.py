@@ -286,3 +286,55 @@ def test_sizes_are_where_the_restricted_likelihood_is_greatest():
     found, uncertainty = restricted_likelihood(residual, jacobian, bare, components, mean, spread)
     best = minimize(cost, mean, method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-9, "maxiter": 4000}).x
     np.testing.assert_allclose(found, best, atol=0.02 * np.sqrt(np.diag(uncertainty)).min())
+
+
+def _disturbed(recording: Recording, triad: str, added) -> Recording:
+    """Return a recording to whose sensor (n, 3) SI were added."""
+    signal = getattr(recording, triad)
+    return replace(recording, **{triad: replace(signal, values=signal.values + added * signal.nominal_scale)})
+
+
+def test_a_warm_up_that_would_pass_for_drift_is_named(tmp_path):
+    """Before its cause is known it makes drift look so large that a recording hardly shows any warm-up."""
+    case = hidden.draw_case(13, (), poses=30, pose_duration=5.0)
+    recording = read_recording(case.write(tmp_path, ("fit",))["fit"])
+    elapsed = recording.gyroscope.time - recording.gyroscope.time[0]
+    warming = -np.exp(-elapsed / 40)[:, None] * 0.01 * np.array([1.0, -0.67, 0.33])
+    found = diagnose(_disturbed(recording, "gyroscope", warming), GRAVITY)
+    (cause,) = found.named
+    assert (
+        cause.name == "gyro.warm_up" and abs(cause.effect.time_constant - 40) < 4 * cause.inner_sigma["time_constant"]
+    )
+
+
+def test_an_accelerometer_that_jumps_is_no_drift(tmp_path):
+    """Jumps scatter poses as no sensor's drift does, and make no cycle either."""
+    case = hidden.draw_case(1306, (), poses=30)
+    recording = read_recording(case.write(tmp_path, ("fit",))["fit"])
+    random, time = np.random.default_rng(30), recording.accelerometer.time
+    part = ((time - time[0]) // 13.0).astype(int)
+    size = 0.2 * random.choice(np.linspace(-0.5, 0.5, 30), part[-1] + 1)
+    found = diagnose(_disturbed(recording, "accelerometer", size[part][:, None] * [1.0, 0.0, 0.0]), GRAVITY)
+    assert found.verdict == "unexplained" and found.p_value < 0.05
+    assert not found.effects and found.shape is None
+    assert any("another cause is likelier" in note for note in found.notes)
+
+
+def test_the_bias_of_each_session_drifts_along_its_own_curve(tmp_path):
+    case = hidden.draw_case(12, (), poses=24)
+    files = case.write(tmp_path, ("fit", "heldout"))
+    sessions = []
+    for path, centre, size in zip(files.values(), (0.55, 0.35), ([0, 2e-3, -1e-3], [1.5e-3, 0, 1.5e-3]), strict=True):
+        recording = read_recording(path)
+        share = np.linspace(0.0, 1.0, len(recording.gyroscope))
+        hump = np.exp(-(((share - centre) / 0.15) ** 2))[:, None] * size
+        sessions.append(_disturbed(recording, "gyroscope", hump))
+    found = diagnose(sessions, GRAVITY)
+    assert found.verdict == "effects"
+    assert {curve.effect.name for curve in found.drifts} == {"gyro.learned_time@1", "gyro.learned_time@2"}
+    assert {cause.name for cause in found.effects} == {curve.effect.name for curve in found.drifts}
+    assert found.gain.smaller(found.extended.effects) and found.gain.log_likelihood > 20
+    kept = found.extended_calibration()
+    for triad, truth in (("accelerometer", case.truth.accel_gain), ("gyroscope", case.truth.gyro_gain)):
+        gain, sigma = np.asarray(kept.triads()[triad].gain), kept.sigma(triad)[0]
+        assert np.all(np.abs(gain - truth) <= 4 * sigma)

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from jaximu.data.drift import drift_components, mean_output_reactions, means_by_hand
+from jaximu.data.drift import drift_components, mean_output_reactions, means_by_hand, recordings_of_poses
 from jaximu.data.handling import bend, handling, moved_by_hand, sway
 from jaximu.data.poses import (
     COARSE_EXCESS,
@@ -165,6 +165,7 @@ class RecordedByHand(OfOneUnit):
         return Observed(
             react,
             (time - time.min()) / max(np.ptp(time), 1e-9),
+            recording=recordings_of_poses(self.segmentations)[real],
             up=unit_vectors(force[real]),
             still=np.ones(len(real), bool),
             number=real,

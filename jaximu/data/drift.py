@@ -19,7 +19,7 @@ from jaximu.estimation.fitting import Fit, unwhitened
 from jaximu.estimation.leave_out import orthonormal
 from jaximu.estimation.problem import Name
 from jaximu.estimation.track import TRIADS
-from jaximu.ground.array_types import BoolArray, FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.quantities import size
 from jaximu.ground.vectors import submatrix, variances_of
 from jaximu.model.noise_model import AxisNoise, NoiseModel
@@ -255,7 +255,6 @@ def means_by_hand(
     """Return the mean outputs in the poses. A gyroscope's bias in a turn is taken to be the mean of its neighbours'."""
     poses = observations.poses
     real = np.flatnonzero(poses.mask)
-    counts = [len(part.intervals) for part in segmentations]
     scales = {name: signal.nominal_scale for name, signal in segmentations[0].recording.signals.items()}
     reactions = {
         name: rows[:, real]
@@ -265,7 +264,13 @@ def means_by_hand(
     scatter = {name: np.asarray(getattr(poses, f"{name}_covariance"))[real] for name in reactions}
     variances = {name: variances_of(covariance) for name, covariance in scatter.items()}
     start, stop = np.asarray(poses.start)[real], np.asarray(poses.stop)[real]
-    return OutputMeans.of(start, stop, np.arange(len(counts)).repeat(counts)[real], reactions, scales, variances)
+    return OutputMeans.of(start, stop, recordings_of_poses(segmentations)[real], reactions, scales, variances)
+
+
+def recordings_of_poses(segmentations: Sequence[Segmentation]) -> IntArray:
+    """Return the place (P,) of the recording that each pose is of."""
+    counts = [len(part.intervals) for part in segmentations]
+    return np.arange(len(counts)).repeat(counts)
 
 
 def mean_output_reactions(reaction: Sensitivities) -> tuple[FloatArray, FloatArray]:

@@ -25,10 +25,18 @@ from jaximu.diagnosis.experiment import Experiment, KnownEffect, State
 from jaximu.diagnosis.extension import Extension, Found, extend, settled
 from jaximu.diagnosis.hidden import Hidden, hidden_causes
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
-from jaximu.diagnosis.learned import LearnedTerm, drifts, learn, left_out, left_out_likelihood, promising
+from jaximu.diagnosis.learned import (
+    LearnedTerm,
+    PromisingCurve,
+    drifts,
+    learn,
+    left_out,
+    left_out_likelihood,
+    promising,
+)
 from jaximu.diagnosis.lines import MovingLine, line_findings, moving_lines, swings_of
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise, usual_noise
-from jaximu.diagnosis.selection import Selection, select, shape_of, standing_out
+from jaximu.diagnosis.selection import Selection, select, shape_of, slow_change, standing_out
 from jaximu.estimation.data import Data
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.rows import ResidualKind, Sizes
@@ -642,6 +650,7 @@ def _examined(examination: Examination) -> Diagnosis:
     course = _with_noise_put_right(examination)
     course.extend()
     course.confirm()
+    course.doubt()
     course.describe()
     return course.diagnosis()
 
@@ -727,11 +736,6 @@ class _Course:
         if self.extension.beside:
             beyond = self.extension.beside
             self.notes.append(f"{self._names()} looks like the cause and is not all of it: beyond it {beyond}.")
-        drift = self.experiment.drift
-        if drift is not None and not self.extension.found:  # what an effect leaves to second order was in it until then
-            self.strange = drift.implausible
-            self._settle(complete=self.extension.complete and not self.strange)
-            self.notes += self.strange
 
     def confirm(self) -> None:
         """Measure the gain on what was not fitted; what gains nothing is not kept."""
@@ -780,39 +784,55 @@ class _Course:
                 "would fit anything, so nothing confirms it. Record more poses."
             )
 
+    def doubt(self) -> None:
+        """Let drift that hardly any sensor has explain nothing; what an effect leaves to second order may be in it."""
+        drift = self.experiment.drift
+        if drift is not None and not self.extension.found:
+            self.strange = drift.implausible
+            self._settle(complete=self.extension.complete and not self.strange)
+            self.notes += self.strange
+
     def describe(self) -> None:
         """Say on what depends that which no cause explains: a shape in words, or a smooth term."""
         experiment, base, state = self.extension.experiment, self.extension.base, self.extension.state
         if self.extension.complete:
             return
-        shape = shape_of(base.evidence, self.examination.level)
+        level = self.examination.level
+        shape = shape_of(base.evidence, level)
         candidate = promising(experiment, state if self.chosen else base)
+        curves, beside = self._followed(candidate)
         imitated = shape if shape and candidate and shape[1] > candidate.gain.log_likelihood else None
-        guessed = False
         if candidate is not None and self.extension.found and not self.chosen:
-            beside = promising(experiment, state)
-            predicted = left_out_likelihood(experiment, state) if beside is None else beside.log_likelihood
+            explained = candidate.log_likelihood if beside is None else left_out_likelihood(experiment, beside.state)
+            further = promising(experiment, state)
+            predicted = left_out_likelihood(experiment, state) if further is None else further.log_likelihood
             kinds = [CATALOGUE[entry.name] for entry in self.extension.found]
             inputs = {(kind.owner, kind.curved()) for kind in kinds if kind.curved()}
             # and not two of the same input
-            one_curve = beside is not None and (beside.effect.owner, beside.effect.curved()) in inputs
+            one_curve = further is not None and (further.effect.owner, further.effect.curved()) in inputs
             # what was named in part was a guess at the same misfit, or the curve is of what it leaves
-            guessed = one_curve or predicted <= candidate.log_likelihood + _GUESSED
-            candidate = candidate if guessed else beside
-        level = self.examination.level
-        learned = candidate and learn(experiment, candidate, self.other, level)
-        drifting, beside = drifts(experiment, learned, level) if learned else ((), None)
-        if imitated and learned and not (drifting and imitated[0].curved in learned.effect.needs):
-            learned, drifting, beside = None, (), None
-        if guessed and learned:
-            self._settle(found=[])
+            if not (one_curve or predicted <= explained + _GUESSED):
+                curves, beside = self._followed(further)
+            elif curves:
+                self._settle(found=[])
+        if imitated and curves and not (beside and imitated[0].curved in curves[0].effect.needs):
+            curves, beside = (), None
         if beside is not None:
-            self._drifts(drifting, beside)
-        elif learned is not None:
-            self.learned = learned
-            self._settle(state=learned.state)
+            self._drifts(curves, beside)
+        elif curves:
+            self.learned = curves[0]
+            self._settle(state=curves[0].state)
         elif shape is not None:
             self.shape = shape[0].words
+
+    def _followed(self, candidate: PromisingCurve | None) -> tuple[Sequence[LearnedTerm], Extension | None]:
+        """Return a curve as it is fitted, or it and all others that drift, as `drifts` does."""
+        experiment, level = self.extension.experiment, self.examination.level
+        learned = candidate and learn(experiment, candidate, self.other, level)
+        if learned is None:
+            return (), None
+        curves, beside = drifts(experiment, learned, level)
+        return curves or (learned,), beside
 
     def _drifts(self, curves: Sequence[LearnedTerm], beside: Extension) -> None:
         """Take curves over the time of recordings for what they are, drift of biases, and the causes beside them."""
@@ -880,8 +900,8 @@ def _with_hands(
 
     Its fit and the causes that stand out are returned as well. A ramp and what temperature does must not pass for
     drift; of several recordings a ramp in one of them may, until it stands out, for the others show what drift is
-    usual. Nor must effects that stand out, however many: drift and hands are estimated again beside them, until they
-    are the same. `known`: a fit and its causes where the noise knows the drift.
+    usual. Nor must effects that stand out, however many, nor slow change that does: drift and hands are estimated again
+    beside them, until they are the same. `known`: a fit and its causes where the noise knows the drift.
     """
     calibration, remade, level = examination.calibration, examination.remade, examination.level
     if known is None:
@@ -902,6 +922,7 @@ def _with_hands(
         base = experiment.fit()
         selection = select(base.evidence, level)
         causes = [base.evidence.blocks[k] for k in standing_out(base.evidence, selection, level)]
+        causes += slow_change(base.evidence, level)
         if {block.name for block in causes} <= before or count == _ROUNDS - 1:
             return experiment, drifted(noise, drift), base, selection
     raise AssertionError

@@ -173,8 +173,9 @@ def drifts(
     terms = [first]
     while terms[-1].of_recording:
         state = terms[-1].state
-        extension = extend(experiment, state, select(state.evidence, level), level)
-        if extension.complete and not extension.findings:
+        selection = select(state.evidence, level)
+        extension = extend(experiment, state, selection, level) if selection.complete else None
+        if extension is not None and extension.complete and not extension.findings:
             if not extension.found or left_out(experiment, state, extension.state, True).log_likelihood > 0:
                 return tuple(_term(state, term.effect.name, term.gain, term.statistic) for term in terms), extension
         candidate = promising(experiment, state)

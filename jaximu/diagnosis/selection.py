@@ -91,7 +91,7 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
     if best and evidence.blocks[best[0]].kind == "effect" and _second_order(evidence, scores, best[0]):
         return Selection((_cause(evidence, close, scores),), True, p_value, scores)
     starts = [(k,) for k in best]
-    while starts and len(starts[0]) < most(evidence):
+    while starts and len(starts[0]) < _MOST:
         ranked = _with_one_more(evidence, starts[:_PARTNERS])
         if together := _explaining(evidence, ranked, explain):
             return Selection(_causes_together(evidence, together), True, p_value, scores)
@@ -125,6 +125,13 @@ def standing_out(evidence: Evidence, selection: Selection, level: float) -> list
             break
         chosen.append(clear[0])
     return chosen
+
+
+def slow_change(evidence: Evidence, level: float) -> list[EffectBlock]:
+    """Return the shapes of slow change, of no cause, that stand out."""
+    slow = [k for k, block in enumerate(evidence.blocks) if (block.kind, block.curved) == ("generic", "time")]
+    p_value = evidence.scores().p_value
+    return [evidence.blocks[k] for k in slow if evidence.family_wise(float(p_value[k])) < level]
 
 
 def shape_of(evidence: Evidence, level: float = LEVEL) -> tuple[EffectBlock, float] | None:

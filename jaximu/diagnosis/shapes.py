@@ -19,11 +19,14 @@ _CYCLES = 2.0, 20.0
 def shapes_without_cause(observed: Observed) -> list[EffectBlock]:
     """Return shapes without a cause and defects of single observations, not whitened.
 
-    Waves of half a period and more over the recording; harmonics of the direction up, of the gyroscope in observations
+    Waves of half a period and more over each recording; harmonics of the direction up, of the gyroscope in observations
     at rest or in all; swings to and fro; smooth functions of temperature; each observation by itself, its force being
     off.
     """
     waves = np.cos(np.pi * observed.share[:, None] * np.arange(1, 6))
+    if observed.recording is not None:
+        alone = np.equal(observed.recording[:, None], np.unique(observed.recording))
+        waves = (waves[:, :, None] * alone[:, None]).reshape(len(waves), -1)
     slow = [_block(observed, triad, f"slow change of the {triad}", waves) for triad in _SIZES]
     blocks = [replace(block, curved="time") for block in slow]
     if observed.up is not None:

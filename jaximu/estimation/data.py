@@ -73,7 +73,8 @@ class Observed:
     """The observations or samples (o,) along which shapes without a cause are looked for.
 
     react: returns how the conditions (n, q) react to a shape of a triad's output, (o, k) alike for each axis or
-    (o, 3, k) of each axis by itself. share (o,): of the recording that has gone by. up (o, 3): the specific force's
+    (o, 3, k) of each axis by itself. share (o,): of the recording that has gone by. recording (o,): of which of
+    several each is. up (o, 3): the specific force's
     direction, None where orientation is not compared. still (o,): observations at rest, None for samples in motion.
     number (o,): of each observation, and alone: those that may be off by themselves. duration: s, within which a bias
     may swing to and fro; None where that is not looked for. attitude (o, 9): the level frame's axes, where they are
@@ -82,6 +83,7 @@ class Observed:
 
     react: Callable[[str, FloatArray], FloatArray]
     share: FloatArray
+    recording: IntArray | None = None
     up: FloatArray | None = None
     still: BoolArray | None = None
     number: IntArray | None = None
