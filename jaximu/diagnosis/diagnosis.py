@@ -217,9 +217,8 @@ class Diagnosis(Result, Document, page="diagnosis"):
     could hide in this recording. not_observable: effects that it cannot show, and why. noise: put right where it was
     wrong. base, extended: the fits. unit: factor by which the noise looked too small. learned: where something stays
     unexplained, a smooth term of what it depends on, which `extended` contains. drifts: among `effects`, biases that
-    drift along curves. options: recordings that would settle
-    a cause, where [`jaximu.planning.separation.advised`][] was asked. shape: where something stays unexplained, what
-    it looks like if one shape without a cause describes it.
+    drift along curves. options: recordings that would settle a cause, where [`jaximu.planning.separation.advised`][]
+    was asked. shape: where something stays unexplained, what it looks like if one shape without a cause describes it.
     """
 
     verdict: str
@@ -837,8 +836,7 @@ class _Course:
     def _drifts(self, curves: Sequence[LearnedTerm], beside: Extension) -> None:
         """Take curves over the time of recordings for what they are, drift of biases, and the causes beside them."""
         causes = [Found(curve.effect.name, (), *curve.evidence) for curve in curves]
-        found = [*self.extension.found, *causes, *beside.found]
-        self._settle(found=found, state=beside.state, complete=True)
+        self._settle(found=[*self.extension.found, *causes, *beside.found], state=beside.state, complete=True)
         gain, otherwise = (left_out(beside.experiment, self.extension.base, beside.state, way) for way in (True, False))
         self.drifts, self.gain = tuple(curves), replace(gain, otherwise=otherwise if otherwise.before.count else None)
 

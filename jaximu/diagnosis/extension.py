@@ -79,16 +79,11 @@ def extend(
     """
     entries: list[Found] = []
     state, poses = base, []
-
-    def fitted(among: Iterable[Effect], imu: Imu) -> State:
-        names = {effect.name for effect in base.effects} | {entry.name for entry in entries}
-        return experiment.fit([effect for effect in among if effect.name in names], imu, base.prior)
-
     causes = causes_of(base.evidence, [effect.name for effect in taken]) if selection.causes or taken else []
     if causes and not selection.explained:
         blocks = base.evidence.blocks
         entries = [_named(blocks, cause) for cause in causes]
-        state = fitted((*base.effects, *taken), base.imu)
+        state = _refitted(experiment, base, (*base.effects, *taken), entries)
         selection = select(state.evidence, level / 100)
     chosen = len(entries)
     guessed = False  # a cause was taken in that did not explain the misfit
@@ -113,35 +108,52 @@ def extend(
         if bumped:
             base = experiment.fit(base.effects, base.imu, base.prior)
         try:
-            state = fitted(effects, state.imu) if entries else base
+            state = _refitted(experiment, base, effects, entries, state.imu) if entries else base
         except NotPossibleError:  # what looks like these effects to first order is none of them
             entries = entries[:before]
-            state = fitted(state.effects, base.imu) if bumped else state
+            state = _refitted(experiment, base, state.effects, entries) if bumped else state
             break
         # what is found once all was explained is mostly chance, or a shape that the refit did not quite meet
         selection = select(state.evidence, level if guessed else level / 100)
     complete = selection.complete and not selection.causes
+    return _doubted(Extension(entries, state, experiment, base, complete, poses), chosen, guessed, level)
+
+
+def _refitted(
+    experiment: Experiment, base: State, among: Iterable[Effect], entries: Sequence[Found], imu: Imu | None = None
+) -> State:
+    """Fit the effects of the base, and those among others that were found."""
+    names = {effect.name for effect in base.effects} | {entry.name for entry in entries}
+    return experiment.fit([effect for effect in among if effect.name in names], imu or base.imu, base.prior)
+
+
+def _doubted(extension: Extension, chosen: int, guessed: bool, level: float) -> Extension:
+    """Return an extension without causes that others make needless, or that only imitate what no catalogue has.
+
+    The first, `chosen` otherwise, stay.
+    """
+    entries, state, complete = extension.found, extension.state, extension.complete
+    experiment, base = extension.experiment, extension.base
     p_value, beside = experiment.beside(state) if complete and entries else (1.0, "")
-    imitated = p_value < level * BESIDE  # by something that the causes look like, and that no catalogue has
+    imitated = p_value < level * BESIDE  # by something that the causes look like
     complete, beside = complete and not imitated, beside if imitated else ""
-    chosen_causes = causes_of(base.evidence, [entry.name for entry in entries[chosen:]])
-    if any(one_curve(base.evidence, a.block, b.block) for a, b in combinations(chosen_causes, 2)):
-        complete = False  # a curve of one input that is in no catalogue, imitated by two that are
-        strongest = max(entries[chosen:], key=lambda entry: entry.statistic)
-        entries = [*entries[:chosen], strongest]
-        state = fitted(state.effects, base.imu)
+    causes = causes_of(base.evidence, [entry.name for entry in entries[chosen:]])
+    if any(one_curve(base.evidence, a.block, b.block) for a, b in combinations(causes, 2)):
+        complete = False  # a curve of one input, imitated by two that are in the catalogue
+        entries = [*entries[:chosen], max(entries[chosen:], key=lambda entry: entry.statistic)]
+        state = _refitted(experiment, base, state.effects, entries)
     for entry in sorted(entries[chosen:], key=lambda entry: entry.statistic) if complete else ():
-        if len(entries) > 1 and not state.differs(entry.name, level):
-            entries.remove(entry)
-            without = fitted(state.effects, state.imu)
-            needed = not select(without.evidence, level).explained
-            entries, state = ([*entries, entry], state) if needed else (entries, without)
-    imitating = _imitating(base.evidence, entries[chosen:], chosen_causes) if guessed else []
+        others = [other for other in entries if other is not entry]
+        if others and not state.differs(entry.name, level):
+            without = _refitted(experiment, base, state.effects, others, state.imu)
+            if select(without.evidence, level).explained:
+                entries, state = others, without
+    imitating = _imitating(base.evidence, entries[chosen:], causes) if guessed else []
     if imitating and len(entries) > 1:
         complete = False
         entries = [entry for entry in entries if entry not in imitating]
-        state = fitted(state.effects, base.imu)
-    return Extension(entries, state, experiment, base, complete, poses, beside)
+        state = _refitted(experiment, base, state.effects, entries)
+    return replace(extension, found=entries, state=state, complete=complete, beside=beside)
 
 
 def _imitating(evidence: Evidence, entries: Sequence[Found], causes: Sequence[SelectedCause]) -> list[Found]:

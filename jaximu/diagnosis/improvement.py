@@ -60,11 +60,6 @@ class Gain:
         """What the extension gains, nats."""
         return self.after.log_likelihood - self.before.log_likelihood
 
-    def up_to(self, last: Gain) -> Gain:
-        """Return what an extension gains together with others taken in after it, up to the last."""
-        otherwise = self.otherwise and last.otherwise and self.otherwise.up_to(last.otherwise)
-        return replace(self, after=last.after, otherwise=otherwise)
-
     def document(self) -> Json:
         """Return the likelihoods as `diagnosis.json` has them."""
         return {

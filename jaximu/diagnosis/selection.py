@@ -28,7 +28,7 @@ which two curves of one input are one curve that the catalogue lacks: each mends
 _SECOND_ORDER = 0.02
 """Share of a strong effect's own χ² that it may leave and still be taken alone: columns are those about a fit without
 the effect, so that a slope of 10 % against the gain leaves 1 % of χ² in the shape of a higher power."""
-_MOST = 3
+MOST = 3
 """Effects that one recording is trusted to name: beyond, combinations imitate what they are not."""
 _PARTNERS = 12
 """Effects, or pairs of them, best first, that are tried with every other where they do not do by themselves."""
@@ -91,7 +91,7 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
     if best and evidence.blocks[best[0]].kind == "effect" and _second_order(evidence, scores, best[0]):
         return Selection((_cause(evidence, close, scores),), True, p_value, scores)
     starts = [(k,) for k in best]
-    while starts and len(starts[0]) < _MOST:
+    while starts and len(starts[0]) < MOST:
         ranked = _with_one_more(evidence, starts[:_PARTNERS])
         if together := _explaining(evidence, ranked, explain):
             return Selection(_causes_together(evidence, together), True, p_value, scores)
@@ -106,7 +106,7 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
 def most(evidence: Evidence) -> int:
     """Return how many effects may be named: each of several recordings may have some that act in it alone."""
     names = [block.name for block in evidence.blocks if block.kind == "effect"]
-    return _MOST * max([1, *(CATALOGUE[name].recording for name in names)])
+    return MOST * max([1, *(CATALOGUE[name].recording for name in names)])
 
 
 def standing_out(evidence: Evidence, selection: Selection, level: float) -> list[int]:

@@ -291,7 +291,7 @@ def _lines_figure(diagnosis: Diagnosis) -> Figure:
 
 
 def _learned_part(diagnosis: Diagnosis) -> Iterator[Section]:
-    for place, curve in enumerate(diagnosis.curves, 1):
+    for index, curve in enumerate(diagnosis.curves, 1):
         name, drift = curve.effect.name, bool(diagnosis.drifts)
         yield Section(
             "How the bias drifts" if drift else "What the misfit depends on",
@@ -302,7 +302,7 @@ def _learned_part(diagnosis: Diagnosis) -> Iterator[Section]:
                 else f"No known effect explains it, but the {curve.triad}'s misfit depends on {curve.covariate}: a "
                 f"smooth curve ({name}) follows it, and the extended calibration contains the curve.",
                 Picture(
-                    "learned" if place == 1 else f"learned_{place}",
+                    "learned" if index == 1 else f"learned_{index}",
                     partial(_learned, curve),
                     "The smooth curve that the misfit follows, with its band",
                     f"What the {curve.triad} puts out by {curve.covariate}, learned from the recording without a "
