@@ -898,8 +898,9 @@ def _with_hands(
 
     Its fit and the causes that stand out are returned as well. A ramp and what temperature does must not pass for
     drift; of several recordings a ramp in one of them may, until it stands out, for the others show what drift is
-    usual. Nor must effects that stand out, however many, nor slow change that does: drift and hands are estimated again
-    beside them, until they are the same. `known`: a fit and its causes where the noise knows the drift.
+    usual. Nor must effects that stand out, however many, nor slow change of one of several recordings: drift and hands
+    are estimated again beside them, until they are the same. `known`: a fit and its causes where the noise knows the
+    drift.
     """
     calibration, remade, level = examination.calibration, examination.remade, examination.level
     if known is None:
@@ -920,7 +921,7 @@ def _with_hands(
         base = experiment.fit()
         selection = select(base.evidence, level)
         causes = [base.evidence.blocks[k] for k in standing_out(base.evidence, selection, level)]
-        causes += slow_change(base.evidence, level)
+        causes += slow_change(base.evidence, level) if len(experiment.recordings) > 1 else []
         if {block.name for block in causes} <= before or count == _ROUNDS - 1:
             return experiment, drifted(noise, drift), base, selection
     raise AssertionError

@@ -83,9 +83,12 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
     def explain(*causes: int) -> bool:
         return evidence.family_wise(evidence.scores(causes).smallest) >= BESIDE * level
 
+    def surprises(cause: int) -> bool:
+        return evidence.family_wise(float(scores.p_value[cause])) < level
+
     best = _leaders(evidence, scores)
     close = [k for k in best if criterion(evidence, scores, k) > criterion(evidence, scores, best[0]) - _TIE]
-    if named := [k for k in close if explain(k)][:1]:
+    if named := [k for k in close if surprises(k) and explain(k)][:1]:
         rivals = [k for k in close if k not in named]
         return Selection((_cause(evidence, named + rivals, scores),), True, p_value, scores)
     if best and evidence.blocks[best[0]].kind == "effect" and _second_order(evidence, scores, best[0]):
@@ -97,8 +100,7 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
             return Selection(_causes_together(evidence, together), True, p_value, scores)
         starts = list(ranked)
     # what lies outside all spans may be the only thing that stands out: then nothing deserves a name
-    named = [k for k in close if evidence.blocks[k].kind == "effect"]
-    named = [k for k in named if evidence.family_wise(float(scores.p_value[k])) < level][:1]
+    named = [k for k in close if evidence.blocks[k].kind == "effect" and surprises(k)][:1]
     rivals = [k for k in close if k not in named]
     return Selection((_cause(evidence, named + rivals, scores),) if named else (), False, p_value, scores)
 
