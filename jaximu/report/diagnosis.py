@@ -293,11 +293,12 @@ def _lines_figure(diagnosis: Diagnosis) -> Figure:
 def _learned_part(diagnosis: Diagnosis) -> Iterator[Section]:
     for index, curve in enumerate(diagnosis.curves, 1):
         name, drift = curve.effect.name, bool(diagnosis.drifts)
+        where = f" in recording {curve.effect.recording}" if curve.effect.recording else ""
         yield Section(
-            "How the bias drifts" if drift else "What the misfit depends on",
+            f"How the {curve.triad}'s bias drifts{where}" if drift else "What the misfit depends on",
             [
-                f"The {curve.triad}'s bias drifts by more than its noise. The extended model has the drift as a curve "
-                f"({name}). It belongs to this recording, and `jaximu compensate` leaves it alone."
+                f"The {curve.triad}'s bias drifts{where} by more than its noise. The extended model has the drift as a "
+                f"curve ({name}). It belongs to this recording, and `jaximu compensate` leaves it alone."
                 if drift
                 else f"No known effect explains it, but the {curve.triad}'s misfit depends on {curve.covariate}: a "
                 f"smooth curve ({name}) follows it, and the extended calibration contains the curve.",
