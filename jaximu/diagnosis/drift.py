@@ -73,12 +73,10 @@ class DriftComponents:
             median, spread = next(usual for kind, usual in _USUAL.items() if name.endswith(kind))
             probability = float(normal_sf(np.log(size / median) / spread))
             if probability < _STRANGE:
-                text = (
-                    f"To explain the misfit, the size of {name} would have to be {size:.3g}, where {median:g} is usual"
-                )
-                sentences[f"{text}, and not one in {1 / _STRANGE:.0f} is as large: another cause is likelier."] = (
-                    probability
-                )
+                sentences[
+                    f"To explain the misfit, the size of {name} would have to be {size:.3g}, where {median:g} is "
+                    f"usual, and not one in {1 / _STRANGE:.0f} is as large: another cause is likelier."
+                ] = probability
         return sentences
 
     @property

@@ -405,11 +405,11 @@ class Experiment(Data):
         whole = Evidence(weights @ linear.conditions[used], jacobian, blocks)
         limits = _limits(whole, model)
         # drift that was estimated may have swallowed what stands out of it all the same
-        clear = 0.0 if self.drift is None else FAMILY_LEVEL / max(len(blocks), 1)
+        clear = [False] * len(blocks) if self.drift is None else whole.scores().p_value * len(blocks) < FAMILY_LEVEL
         visible = [
             block
-            for block, p_value in zip(blocks, whole.scores().p_value, strict=True)
-            if block.kind != "effect" or p_value < clear or limits[block.name][0] < _PLAUSIBLE * np.max(block.sizes)
+            for block, stands in zip(blocks, clear, strict=True)
+            if block.kind != "effect" or stands or limits[block.name][0] < _PLAUSIBLE * np.max(block.sizes)
         ]
         for name in sorted({block.name for block in blocks} - {block.name for block in visible}):
             blind[name] = (
