@@ -31,7 +31,6 @@ from jaximu.diagnosis.learned import (
     drifts,
     learn,
     left_out,
-    left_out_likelihood,
     promising,
 )
 from jaximu.diagnosis.lines import MovingLine, line_findings, moving_lines, swings_of
@@ -799,21 +798,10 @@ class _Course:
         level = self.examination.level
         shape = shape_of(base.evidence, level)
         candidate = promising(experiment, state if self.chosen else base)
-        curves, beside = self._followed(candidate)
         imitated = shape if shape and candidate and shape[1] > candidate.gain.log_likelihood else None
-        if candidate is not None and self.extension.found and not self.chosen:
-            explained = candidate.log_likelihood if beside is None else left_out_likelihood(experiment, beside.state)
-            further = promising(experiment, state)
-            predicted = left_out_likelihood(experiment, state) if further is None else further.log_likelihood
-            kinds = [CATALOGUE[entry.name] for entry in self.extension.found]
-            inputs = {(kind.owner, kind.curved()) for kind in kinds if kind.curved()}
-            # and not two of the same input
-            one_curve = further is not None and (further.effect.owner, further.effect.curved()) in inputs
-            # what was named in part was a guess at the same misfit, or the curve is of what it leaves
-            if not (one_curve or predicted <= explained + _GUESSED):
-                curves, beside = self._followed(further)
-            elif curves:
-                self._settle(found=[])
+        curves, beside = self._followed(candidate)
+        if candidate is not None and not self.chosen:
+            curves, beside = self._compared(candidate, curves, beside)
         if imitated and curves and not (beside and imitated[0].curved in curves[0].effect.needs):
             curves, beside = (), None
         if beside is not None:
@@ -824,7 +812,7 @@ class _Course:
         elif shape is not None:
             self.shape = shape[0].words
 
-    def _followed(self, candidate: PromisingCurve | None) -> tuple[Sequence[LearnedTerm], Extension | None]:
+    def _followed(self, candidate: PromisingCurve | None) -> _Curves:
         """Return a curve as it is fitted, or it and all others that drift, as `drifts` does."""
         experiment, level = self.extension.experiment, self.examination.level
         learned = candidate and learn(experiment, candidate, self.other, level)
@@ -833,10 +821,35 @@ class _Course:
         curves, beside = drifts(experiment, learned, level)
         return curves or (learned,), beside
 
+    def _compared(self, candidate: PromisingCurve, curves: Sequence[LearnedTerm], beside: Extension | None) -> _Curves:
+        """Return curves in place of what was named, or others beside it, whichever predict better what is left out.
+
+        Where nothing was named, the others are drift of the recordings, beside which causes may show.
+        """
+        experiment, state, named = self.extension.experiment, self.extension.state, self.extension.found
+        if not named and candidate.effect.scope == "session":
+            return curves, beside
+        further = promising(experiment, state, of_recording=not named)
+        others = self._followed(further)
+        before, after = _ended(self.extension.base, curves, beside), _ended(state, *others)
+        # drift cannot be predicted beyond the time in which it was seen
+        drifting = any(effect.scope == "session" for effect in (*before.effects, *after.effects))
+        gained = left_out(experiment, before, after, drifting).log_likelihood
+        inputs = {(kind.owner, kind.curved()) for kind in (CATALOGUE[entry.name] for entry in named) if kind.curved()}
+        # and not two of the same input
+        one_curve = further is not None and (further.effect.owner, further.effect.curved()) in inputs
+        # what was named in part was a guess at the same misfit, or the curve is of what it leaves
+        if gained > _GUESSED and not one_curve:
+            return others
+        if curves:
+            self._settle(found=[])
+        return curves, beside
+
     def _drifts(self, curves: Sequence[LearnedTerm], beside: Extension) -> None:
         """Take curves over the time of recordings for what they are, drift of biases, and the causes beside them."""
         causes = [Found(curve.effect.name, (), *curve.evidence) for curve in curves]
-        self._settle(found=[*self.extension.found, *causes, *beside.found], state=beside.state, complete=True)
+        together = [*self.extension.found, *causes, *beside.found]
+        self._settle(found=together, state=beside.state, complete=beside.complete)
         gain, otherwise = (left_out(beside.experiment, self.extension.base, beside.state, way) for way in (True, False))
         self.drifts, self.gain = tuple(curves), replace(gain, otherwise=otherwise if otherwise.before.count else None)
 
@@ -889,6 +902,17 @@ class _Course:
             self.drifts,
             shape=self.shape,
         )
+
+
+_Curves = tuple[Sequence[LearnedTerm], Extension | None]
+"""Curves of a fit, and what was found beside them where they are drift."""
+
+
+def _ended(state: State, curves: Sequence[LearnedTerm], beside: Extension | None) -> State:
+    """Return the fit with curves and what was found beside them; the one without, where there are none."""
+    if beside is not None:
+        return beside.state
+    return curves[-1].state if curves else state
 
 
 def _with_hands(

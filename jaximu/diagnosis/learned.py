@@ -19,7 +19,7 @@ from scipy.linalg import solve_triangular
 from jaximu.diagnosis.experiment import LEAST_WARMING, Experiment, State
 from jaximu.diagnosis.extension import Extension, extend
 from jaximu.diagnosis.improvement import Gain, Prediction, on_held_out, parts_left_out
-from jaximu.diagnosis.selection import LEVEL, select
+from jaximu.diagnosis.selection import LEVEL, Selection, select
 from jaximu.estimation.fitting import Prior
 from jaximu.estimation.leave_out import LeftOut, further, leave_out, orthonormal
 from jaximu.estimation.problem import Name
@@ -117,18 +117,14 @@ class PromisingCurve:
     spread: FloatArray
     gain: Gain
 
-    @property
-    def log_likelihood(self) -> float:
-        """Of all parts of the recording left out in turn, nats."""
-        return (self.gain.otherwise or self.gain).after.log_likelihood
 
-
-def promising(experiment: Experiment, state: State) -> PromisingCurve | None:
+def promising(experiment: Experiment, state: State, of_recording: bool = False) -> PromisingCurve | None:
     """Return the smooth curve of one covariate, on one triad, that predicts best what was left out; None if none pays.
 
-    **Arguments:** `state`: a fit that leaves something unexplained.
+    **Arguments:** `state`: a fit that leaves something unexplained; `of_recording`: whether only curves over the time
+    of a recording are asked.
     """
-    for interleaved in (False, True):
+    for interleaved in (True,) if of_recording else (False, True):
         best = _best(experiment, state, interleaved)
         if best is not None and best.gain.log_likelihood > (0 if interleaved else _PAYS):
             return best
@@ -165,8 +161,8 @@ def drifts(
 ) -> tuple[tuple[LearnedTerm, ...], Extension | None]:
     """Return curves over time, each of a sensor in a recording, and the extension of a fit with them by causes.
 
-    Together they leave nothing unexplained. Where none do there are no curves, and no extension. A cause beside them
-    must predict better what is left out.
+    They are as many as leave nothing unexplained, or as pay. One that leaves something, and beside which nothing is
+    found, is a shape and no drift: then there are no curves, and no extension.
 
     **Arguments:** `first`: the curve that explains most; `level`: of what all leave.
     """
@@ -174,16 +170,25 @@ def drifts(
     while terms[-1].of_recording:
         state = terms[-1].state
         selection = select(state.evidence, level)
-        extension = extend(experiment, state, selection, level) if selection.complete else None
-        if extension is not None and extension.complete and not extension.findings:
-            if not extension.found or left_out(experiment, state, extension.state, True).log_likelihood > 0:
-                return tuple(_term(state, term.effect.name, term.gain, term.statistic) for term in terms), extension
-        candidate = promising(experiment, state)
-        term = candidate and learn(experiment, candidate, None, level)
-        if term is None:
+        beside = _causes_beside(experiment, state, selection, level) if selection.complete else None
+        if beside is None or not beside.complete:
+            candidate = promising(experiment, state, of_recording=True)
+            term = candidate and learn(experiment, candidate, None, level)
+            if term is not None:
+                terms.append(term)
+                continue
+            beside = beside or _causes_beside(experiment, state, selection, level)
+        if not (beside.complete or beside.found or len(terms) > 1):
             break
-        terms.append(term)
+        return tuple(_term(state, term.effect.name, term.gain, term.statistic) for term in terms), beside
     return (), None
+
+
+def _causes_beside(experiment: Experiment, state: State, selection: Selection, level: float) -> Extension:
+    """Return the causes beside curves: those that predict better, together, what is left out."""
+    extension = extend(experiment, state, selection, level)
+    worse = extension.found and left_out(experiment, state, extension.state, True).log_likelihood <= 0
+    return Extension([], state, experiment, state, False, []) if worse or extension.findings else extension
 
 
 def _best(experiment: Experiment, state: State, interleaved: bool) -> PromisingCurve | None:
@@ -213,11 +218,6 @@ def _best(experiment: Experiment, state: State, interleaved: bool) -> PromisingC
     effect, spread, columns, gained = best
     both = interleaved and parts[False].parts
     return PromisingCurve(state, effect, spread, replace(gained, otherwise=gain(columns, False) if both else None))
-
-
-def left_out_likelihood(experiment: Experiment, state: State) -> float:
-    """Return the log-likelihood (nats) of parts left out in turn, as a fit predicts them without a smooth term."""
-    return _Parts.of(experiment, False, state)[0].plain.log_likelihood
 
 
 def left_out(experiment: Experiment, before: State, after: State, interleaved: bool = False) -> Gain:

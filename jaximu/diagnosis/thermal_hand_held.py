@@ -18,7 +18,7 @@ from jaximu.calibration.refusals import require_solved
 from jaximu.data.rest_blocks import LEAST_RANGE
 from jaximu.diagnosis.diagnosis import extended, recorded_by_hand
 from jaximu.diagnosis.experiment import Experiment, State
-from jaximu.diagnosis.learned import left_out_likelihood
+from jaximu.diagnosis.learned import left_out
 from jaximu.diagnosis.noise import usual_noise
 from jaximu.diagnosis.selection import criterion
 from jaximu.estimation.rows import Sizes
@@ -154,7 +154,7 @@ def _extended(experiment: Experiment, state: State) -> tuple[State, list[tuple[s
         except NotPossibleError:  # beside the others it comes to nothing
             refused.add(name)
             continue
-        gain = left_out_likelihood(experiment, extension) - left_out_likelihood(experiment, state)
+        gain = left_out(experiment, state, extension).log_likelihood
         if gain > 0:
             state = extension
             steps.append((name, statistic, gain))
