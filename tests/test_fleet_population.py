@@ -111,6 +111,21 @@ def test_nothing_is_found_where_nothing_is(tmp_path):
     assert max(alarms.values()) <= limit, alarms
 
 
+@pytest.mark.parametrize("count", [8, 12, 30])
+def test_of_few_units_no_ordinary_one_is_a_stranger(count):
+    """In four fleets of five of eight alike units one was, the population taken as known: 'p 1e-31'."""
+    alarms = misses = 0
+    for seed in range(150):
+        _, covariance, _, y, noise = draw(1000 + seed, count)
+        population = estimate_population(NAMES, y, noise)
+        alarms += np.min(population.p_values(y, noise, population.kept)) * count < 0.01
+        y[0, 3] += 25 * np.sqrt(covariance[3, 3])
+        population = estimate_population(NAMES, y, noise)
+        misses += np.argmin(p_values := population.p_values(y, noise, population.kept)) or p_values[0] * count > 0.01
+    assert alarms <= binom.isf(1e-3, 150, 0.01)
+    assert misses <= 15
+
+
 def test_strangers_are_found_and_named(tmp_path):
     _, covariance, _, y, noise = draw(4, 120)
     y[17, 3] += 15 * np.sqrt(covariance[3, 3])

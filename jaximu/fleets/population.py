@@ -25,9 +25,9 @@ from jaximu.diagnosis.common_drift import CommonDrift, RestingRates
 from jaximu.diagnosis.evidence import FAMILY_LEVEL
 from jaximu.estimation.problem import Name
 from jaximu.fleets.rows import COLUMN_PLACES, PARAMETERS, SCHEMA, covariances, free_places, require_table
-from jaximu.ground.array_types import FloatArray, IntArray
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.atomic import atomic_write
-from jaximu.ground.distributions import robust_sigma
+from jaximu.ground.distributions import normal_isf, normal_sf, robust_sigma
 from jaximu.ground.document import Document, Json, entries
 from jaximu.ground.errors import FilePath, NotPossibleError
 from jaximu.ground.page import Result
@@ -46,6 +46,8 @@ _UNITS_COMPARED = 32
 LEVEL = 0.01
 """Probability of one false alarm in the whole fleet, for each kind of question."""
 _ROUNDS = 200
+_OF_MEDIANS = 0.37
+"""Efficiency of the median absolute deviation: as many units, by their squares, know a variance as well."""
 _YEAR = 365.25  # days
 _COLUMNS = (
     "device",
@@ -75,13 +77,15 @@ class Population:
     """Mean (p,) and covariance (p, p) of parameters relative to the data sheet: gains in scales, biases in SI.
 
     alone: standard deviations (p,) of the estimates as they are, their own noise included. count: units it rests on.
+    kept (n,): which of those that were asked they are.
     """
 
     names: tuple[Name, ...]
     mean: FloatArray
     covariance: FloatArray
     alone: FloatArray
-    count: int
+    count: float
+    kept: BoolArray
 
     @property
     def spread(self) -> FloatArray:
@@ -96,10 +100,42 @@ class Population:
         mean = self.mean + np.einsum("nij,nj->ni", gain, values - self.mean)
         return mean, (posterior + posterior.swapaxes(1, 2)) / 2
 
-    def distances(self, values: FloatArray, covariances: FloatArray) -> FloatArray:
-        """Return the squared distances (n,) from the population, χ² with p degrees for units that belong."""
-        rest = values - self.mean
-        return np.einsum("ni,ni->n", rest, np.linalg.solve(self.covariance + covariances, rest[..., None])[..., 0])
+    def scores(self, values: FloatArray, covariances: FloatArray, inside: BoolArray) -> FloatArray:
+        """Return how far units (n,) are from all others, by parameter (n, p): normal for units that belong.
+
+        What is estimated of a variance has Student's law: a deviation becomes the normal one of the same probability.
+        A unit that is `inside` the population is taken out of it first (the externally studentised residual; Cook and
+        Weisberg, Residuals and Influence in Regression, 1982, sec. 2.2.1).
+        """
+        inside, others = inside[:, None], self.count - 1
+        variance = np.diagonal(self.covariance) + variances_of(covariances)
+        share = self._share(covariances)
+        rest = (values - self.mean) / np.sqrt(variance)
+        factor = np.where(inside, others - share * rest**2, others + 2 * share) / (others - inside)
+        tail = scipy.stats.t.sf(np.abs(rest) / np.sqrt(np.maximum(factor, 1e-9)), (others - inside) / share**2)
+        return np.copysign(normal_isf(np.maximum(tail, 1e-300)), rest)
+
+    def _share(self, covariances: FloatArray) -> FloatArray:
+        """Return the shares (n, p) of estimates' variances that lie between units, and were estimated."""
+        spread = np.diagonal(self.covariance)
+        return spread / (spread + variances_of(covariances))
+
+    def p_values(self, values: FloatArray, covariances: FloatArray, inside: BoolArray) -> FloatArray:
+        """Return the probabilities (n,) that a unit that belongs is as far, by one parameter or by all together.
+
+        Squared distances of all together have the laws of Hotelling's T², with as many units as `estimate_population`
+        adds to the covariance and as the noise of estimates, which is known, is worth.
+        """
+        size, scores = len(self.names), self.scores(values, covariances, inside)
+        total = self.covariance + covariances
+        sigma = sigmas_of(total)
+        alike = total / sigma[:, :, None] / sigma[:, None, :]
+        squared = np.einsum("ni,ni->n", scores, np.linalg.solve(alike, scores[..., None])[..., 0])
+        known = (self.count + size) / np.mean(self._share(covariances) ** 2, axis=1)
+        inner = scipy.stats.beta.sf(squared * known / (known - 1) ** 2, size / 2, (known - size - 1) / 2)
+        outer = scipy.stats.f.sf(squared * known * (known - size) / (known**2 - 1) / size, size, known - size)
+        by_one = 2 * size * normal_sf(np.max(np.abs(scores), axis=1))
+        return np.minimum(1.0, 2 * np.minimum(np.where(inside, inner, outer), by_one))
 
 
 @dataclass(frozen=True)
@@ -228,23 +264,23 @@ def estimate_population(names: Sequence[Name], values: FloatArray, covariances: 
     Units farther off than one in a hundred fleets would have are left out, at most half. With few units the covariance
     leans towards its diagonal: p units' worth of none. Raises `NotPossibleError` for fewer than `FEWEST` units.
     """
-    count, size = values.shape
+    count = len(values)
     if count < FEWEST:
         raise NotPossibleError(f"{count} calibrated units are too few for a population: it takes {FEWEST} or more.")
     mean = np.median(values, axis=0)
     noise = np.median(variances_of(covariances), axis=0)
     scatter = np.square(robust_sigma(values - mean, axis=0))
     covariance = np.diag(np.maximum(scatter - noise, 0.01 * scatter + 1e-18))
-    limit = float(scipy.stats.chi2.isf(LEVEL / count, size))
-    kept = np.zeros(count, bool)
+    population = Population(tuple(names), mean, covariance, noise, _OF_MEDIANS * count, np.zeros(count, bool))
     for _ in range(10):
-        distance = Population(tuple(names), mean, covariance, noise, count).distances(values, covariances)
-        belongs = distance <= max(limit, float(np.median(distance)))
-        if (belongs == kept).all():
+        p_values = population.p_values(values, covariances, population.kept)
+        belongs = p_values >= min(LEVEL / count, float(np.median(p_values)))
+        if (belongs == population.kept).all():
             break
-        kept = belongs
-        mean, covariance = _maximise(values[kept], covariances[kept], mean, covariance)
-    return Population(tuple(names), mean, covariance, values[kept].std(axis=0, ddof=1), int(kept.sum()))
+        mean, covariance = _maximise(values[belongs], covariances[belongs], population.mean, population.covariance)
+        alone = values[belongs].std(axis=0, ddof=1)
+        population = Population(population.names, mean, covariance, alone, int(belongs.sum()), belongs)
+    return population
 
 
 def _maximise(values, covariances, mean, covariance):
@@ -398,7 +434,7 @@ def _of_population(path: Path, units: _Units, gyroscope: bool, total: int) -> Js
     shrunk, spread = population.shrink(centred, units.covariances)
     return dict(
         population=population,
-        strangers=_strangers(path, gyroscope, population, shifts, total),
+        strangers=_strangers(path, gyroscope, population, units, shifts, total),
         differences=tuple(sorted(differences, key=lambda difference: difference.p_value)),
         values=units.values,
         shrunk=shrunk + shift,
@@ -417,20 +453,23 @@ def _names(units: _Units) -> list[str]:
 # --- what stands out --------------------------------------------------------------------------------------------------
 
 
-def _strangers(path: Path, gyroscope: bool, population: Population, shifts: Shifts, total: int):
-    """Units farther from the population, or from their lot and date, than one in a hundred fleets would have."""
+def _strangers(path: Path, gyroscope: bool, population: Population, asked: _Units, shifts: Shifts, total: int):
+    """Units farther from the population, or from their lot and date, than one in a hundred fleets would have.
+
+    asked: the units that the population was estimated from.
+    """
+    members = {(row["device"], row["file"]) for row, kept in zip(asked.rows, population.kept, strict=True) if kept}
     strangers = []
     for rows in _groups(path, gyroscope):
         units = _units(rows, gyroscope)
-        centred = units.values - shifts.of(rows)
-        distances = population.distances(centred, units.covariances)
-        p_values = scipy.stats.chi2.sf(distances, len(population.names)) * total
+        inside = np.array([(row["device"], row["file"]) in members for row in rows], bool)
+        compared = units.values - shifts.of(rows), units.covariances, inside
+        p_values = population.p_values(*compared) * total
+        scores = population.scores(*compared)
         for index in np.flatnonzero(p_values < LEVEL):
-            variance = np.diagonal(units.covariances[index])
-            z = (centred[index] - population.mean) / np.sqrt(np.diagonal(population.covariance) + variance)
+            z, row = scores[index], rows[index]
             worst = (-np.abs(z)).argsort()[:3]
             named = tuple((population.names[k], float(units.values[index, k]), float(z[k])) for k in worst)
-            row = units.rows[index]
             strangers.append(Stranger(row["device"], row["file"], float(min(1.0, p_values[index])), named))
     return tuple(sorted(strangers, key=lambda stranger: stranger.p_value))
 
@@ -522,13 +561,10 @@ def _lots_and_dates(units: _Units) -> tuple[list[Difference], Shifts]:
     shifts = Shifts({}, np.zeros(size), groups.middle)
     if not (groups.names or groups.dated) or len(units.rows) < FEWEST:
         return [], shifts
-    within = groups.within(units.values)
-    inside = estimate_population(units.names, within, units.covariances)
-    limit = scipy.stats.chi2.isf(LEVEL / len(within), size)
-    usual = inside.distances(within, units.covariances) <= limit
+    inside = estimate_population(units.names, groups.within(units.values), units.covariances)
     findings = {}
     for k, name in enumerate(units.names):
-        weight = usual / (inside.covariance[k, k] + units.covariances[:, k, k])
+        weight = inside.kept / (inside.covariance[k, k] + units.covariances[:, k, k])
         for cause, amount, sigma, p_value in _causes(groups, units.values[:, k], weight, size):
             findings.setdefault(cause, []).append((p_value, (name, amount, sigma)))
             if cause == len(groups.names):
