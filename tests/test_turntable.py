@@ -483,6 +483,17 @@ def test_degrees_called_radians(box, schedule):
         calibrate_turntable(recording, entries, EXACT)
 
 
+def test_exchanged_axes_are_no_radians(box):
+    """What an axis shows of turns about another was 1/57 of the angle: "correct the unit"."""
+    recording, truth = box
+    leak = np.eye(3) + (np.ones((3, 3)) - np.eye(3)) / 57.3
+    gyroscope = recording.gyroscope
+    leaking = replace(recording, gyroscope=replace(gyroscope, values=gyroscope.values @ leak.T))
+    entries = [replace(e, vector=np.asarray(e.vector)[[1, 2, 0]]) for e in truth.schedule]
+    with pytest.raises(InputError, match="does not describe this turn"):
+        calibrate_turntable(leaking, entries, EXACT)
+
+
 def test_wrong_turns_and_poses(box):
     recording, truth = box
     entries = truth.schedule

@@ -5,7 +5,7 @@
     source = "data sheet rev. 3, table 4"
 
     [limits]
-    "accelerometer.bias" = "40 mg"       # from −40 to 40 mg, each axis; the offset at zero input
+    "accelerometer.bias" = "40 mg"       # from −40 to 40 mg, each axis; the output at zero input over its gain
     "accelerometer.scale" = "1 %"        # off its nominal value, each axis
     "gyroscope.misalignment" = "10 mrad" # cross-axis gain over the axis's own; [1,0]: output y, input x
     "gyroscope.bias[2]" = { low = "-0.5 deg/s", high = "1 deg/s", source = "customer's drawing" }

@@ -269,7 +269,7 @@ def _calibrated(
         method="magnetometer",
         loss="linear",
         excess_names=EXCESS_NAMES,
-        rms=[{"field_strength": (_spread(imu, windows, known), "uT")} for imu in (start, fit.imu)],
+        rms=[{"field_strength": (_spread(imu, windows, known), "uT")} for imu in (_with_iron(start), fit.imu)],
         data=_data(logs, windows),
         nominal=Imu.nominal() if logs[0].recording is None else as_stated(logs[0].recording),
         advice=field_advice,
@@ -751,7 +751,7 @@ def _left_out(
     fold = np.minimum(np.arange(len(windows)) * _FOLDS // len(windows), _FOLDS - 1)
     strengths: dict[str, list[FloatArray]] = {"before": [], "after": [], "algebraic": []}
     headings: dict[str, list[FloatArray]] = {"before": [], "after": []}
-    raw = replace(start, magnetometer=replace(_magnetometer(start), bias=np.zeros(3)))
+    raw = _with_iron(start)
     for number in range(_FOLDS):
         inside = (fold == number) & windows.used
         rest = windows.without(fold == number)
@@ -779,6 +779,11 @@ def _left_out(
     off = {name: np.concatenate([np.zeros(0), *parts]) for name, parts in headings.items()}
     turned = {name: rms(np.degrees(errors)) for name, errors in off.items() if len(errors)}
     return spreads, turned or None
+
+
+def _with_iron(imu: Imu) -> Imu:
+    """Return a unit whose hard iron is left in what it puts out."""
+    return replace(imu, magnetometer=replace(_magnetometer(imu), bias=np.zeros(3)))
 
 
 def carried_headings(windows: FieldWindows, imu: Imu, rows: IntArray) -> FloatArray:

@@ -23,7 +23,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf, rms
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
-from jaximu.ground.vectors import column_lengths, lengths_of, submatrix
+from jaximu.ground.vectors import column_lengths, sigmas_of, submatrix
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.base import Extent
@@ -166,8 +166,8 @@ class MagneticShift:
     """How a magnetometer differs from its old calibration.
 
     statistic, freedom, p_value: of all parameters together, if none had moved. iron (3,), iron_sigma (3,): change of
-    the hard iron, µT. heading: degrees, rms over level headings, that the old calibration is off by now; None without
-    a dip.
+    the hard iron as a field, µT. heading: degrees, rms over level headings, that the old calibration is off by now;
+    None without a dip.
     """
 
     statistic: float
@@ -246,13 +246,13 @@ def check_magnetometer(old: Calibration, new: Calibration) -> MagneticShift:
     left, root = basis.T @ shift, np.linalg.cholesky(basis.T @ spread @ basis)
     statistic = float(np.sum(np.linalg.solve(root, left) ** 2))
     iron = [k for k, name in enumerate(names) if name.part == "bias"]
-    scale = float(np.mean(lengths_of(gains[0])))
+    inverse = np.linalg.inv(gains[0])
     return MagneticShift(
         statistic,
         len(left),
         float(chi2_sf(statistic, len(left))),
-        shift[iron] / scale,
-        np.sqrt(np.diagonal(spread))[iron] / scale,
+        inverse @ shift[iron],
+        sigmas_of(inverse @ submatrix(spread, iron) @ inverse.T),
         _heading_off(triads, new.magnetic or {}),
     )
 

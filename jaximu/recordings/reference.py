@@ -131,7 +131,7 @@ def _with_sense(entry: ScheduleEntry, rate: Integral, bias: FloatArray, notes: l
 
 def _require_units(turns: Sequence[tuple[ScheduleEntry, FloatArray]], where: str) -> None:
     """Refuse angles in another unit than the gyroscope's; `turns`: with the angle (3,) that the gyroscope shows."""
-    ratio = np.median([abs(turned @ entry.vector / entry.angle) for entry, turned in turns] or [1.0])
+    ratio = np.median([np.linalg.norm(turned) / abs(entry.angle) for entry, turned in turns] or [1.0])
     for slip, unit, other in ((57.29578, "rad", "deg"), (1 / 57.29578, "deg", "rad")):
         if abs(math.log(max(ratio, 1e-9) / slip)) < math.log(1.4):
             raise InputError(
