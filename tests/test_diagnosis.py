@@ -11,7 +11,10 @@ import pytest
 from jaximu import LocalGravity, load_calibration, read_recording
 from jaximu.cli.app import main
 from jaximu.diagnosis import diagnose, twin_of
+from jaximu.model.effects import CATALOGUE
 from jaximu.noise.at_rest import fit_noise
+from jaximu.simulation import Environment, consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import HandHeld
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 ANSWERS = "answers.json"
@@ -300,6 +303,20 @@ def test_a_bumped_pose_is_found_and_left_out(studied, clean_found):
     assert found.verdict == "adequate"
     (finding,) = [each for each in found.preflight if each.name == "data.bumped_pose"]
     assert f"{start:.1f}" in finding.text
+
+
+def test_of_three_causes_that_explain_all_none_is_a_fit_to_anything():
+    """Fewer turns than parameters, which other conditions tell as well: it was "it would fit anything"."""
+    causes = {
+        "gyro.g_sensitivity": [4e-4] + 8 * [0.0],
+        "gyro.temperature": [0, 4e-4, 0],
+        "accel.temperature": [4e-3, 0, 0],
+    }
+    imu = draw_imu(3).with_effects(*(CATALOGUE[name].make(np.array(values)) for name, values in causes.items()))
+    environment = Environment(temperature=[[0, 25.0], [150, 35.0]])
+    recording, _ = simulate(imu, HandHeld(18, 5.0), consumer_noise(), rate=100.0, seed=3, environment=environment)
+    found = diagnose(recording, GRAVITY)
+    assert found.verdict == "effects" and {each.name for each in found.effects} == set(causes)
 
 
 def test_an_exact_fit_is_no_evidence(clean_found):

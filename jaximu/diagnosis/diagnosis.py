@@ -39,7 +39,7 @@ from jaximu.diagnosis.selection import Selection, select, shape_of, slow_change,
 from jaximu.estimation.data import Data
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.rows import ResidualKind, Sizes
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError, NotPossibleError, nearest
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
@@ -775,7 +775,7 @@ class _Course:
                 gained = f"does not improve data that was not fitted ({gain.data}: {errors})"
             self.notes.append(f"{self._names()} would explain part of this recording but {gained}, and was not kept.")
             self._settle(found=[], state=base, complete=False)
-        elif full:
+        elif full := _saturated(experiment, state, beside=True):
             self._settle(complete=False)
             self.notes.append(
                 f"with {self._names()} the model has as many parameters as there are conditions of {full[0].words}: it "
@@ -1014,12 +1014,17 @@ def same_device(first: Calibration, other: Calibration) -> list[str]:
     return notes
 
 
-def _saturated(experiment: Experiment, state: State) -> list[ResidualKind]:
-    """Return the kinds of conditions of which the parameters leave none over."""
+def _saturated(experiment: Experiment, state: State, beside: bool = False) -> list[ResidualKind]:
+    """Return the kinds of conditions of which the parameters leave none over, `beside` all others, or by themselves."""
     jacobian = np.linalg.solve(state.weights, state.evidence.jacobian)
     jacobian /= np.maximum(column_lengths(jacobian), 1e-300)
-    parts = [(kind, jacobian[experiment.real.kind == k]) for k, kind in enumerate(experiment.real.kinds)]
-    return [kind for kind, part in parts if len(part) and np.linalg.matrix_rank(part, 1e-6) == len(part)]
+
+    def rank(rows: BoolArray) -> int:
+        return int(np.linalg.matrix_rank(jacobian[rows], 1e-6)) if rows.any() else 0
+
+    parts = [(kind, experiment.real.kind == k) for k, kind in enumerate(experiment.real.kinds)]
+    known = [rank(part) if not beside else rank(part | ~part) - rank(~part) for _, part in parts]
+    return [kind for (kind, part), size in zip(parts, known, strict=True) if part.any() and size == part.sum()]
 
 
 def _named(experiment: Experiment, state: State, entry: Found, gain: Gain | None) -> Named:
