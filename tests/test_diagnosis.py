@@ -316,7 +316,7 @@ def test_of_three_causes_that_explain_all_none_is_a_fit_to_anything():
     environment = Environment(temperature=[[0, 25.0], [150, 35.0]])
     recording, _ = simulate(imu, HandHeld(18, 5.0), consumer_noise(), rate=100.0, seed=3, environment=environment)
     found = diagnose(recording, GRAVITY)
-    assert found.verdict == "effects" and {each.name for each in found.effects} == set(first)
+    assert found.verdict == "effects" and {each.name for each in found.effects} == set(causes)
 
 
 def test_an_exact_fit_is_no_evidence(clean_found):
