@@ -46,8 +46,6 @@ _UNITS_COMPARED = 32
 LEVEL = 0.01
 """Probability of one false alarm in the whole fleet, for each kind of question."""
 _ROUNDS = 200
-_OF_MEDIANS = 0.37
-"""Efficiency of the median absolute deviation: as many units, by their squares, know a variance as well."""
 _YEAR = 365.25  # days
 _COLUMNS = (
     "device",
@@ -107,13 +105,13 @@ class Population:
         A unit that is `inside` the population is taken out of it first (the externally studentised residual; Cook and
         Weisberg, Residuals and Influence in Regression, 1982, sec. 2.2.1).
         """
-        inside, others = inside[:, None], self.count - 1
+        inside, others, tiny = inside[:, None], self.count - 1, np.finfo(float).tiny
         variance = np.diagonal(self.covariance) + variances_of(covariances)
         share = self._share(covariances)
         rest = (values - self.mean) / np.sqrt(variance)
         factor = np.where(inside, others - share * rest**2, others + 2 * share) / (others - inside)
-        tail = scipy.stats.t.sf(np.abs(rest) / np.sqrt(np.maximum(factor, 1e-9)), (others - inside) / share**2)
-        return np.copysign(normal_isf(np.maximum(tail, 1e-300)), rest)
+        tail = scipy.stats.t.sf(np.abs(rest) / np.sqrt(np.maximum(factor, tiny)), (others - inside) / share**2)
+        return np.copysign(normal_isf(np.maximum(tail, tiny)), rest)
 
     def _share(self, covariances: FloatArray) -> FloatArray:
         """Return the shares (n, p) of estimates' variances that lie between units, and were estimated."""
@@ -271,7 +269,8 @@ def estimate_population(names: Sequence[Name], values: FloatArray, covariances: 
     noise = np.median(variances_of(covariances), axis=0)
     scatter = np.square(robust_sigma(values - mean, axis=0))
     covariance = np.diag(np.maximum(scatter - noise, 0.01 * scatter + 1e-18))
-    population = Population(tuple(names), mean, covariance, noise, _OF_MEDIANS * count, np.zeros(count, bool))
+    # medians know a variance as well as the squares of a third of the units do
+    population = Population(tuple(names), mean, covariance, noise, count / 3, np.zeros(count, bool))
     for _ in range(10):
         p_values = population.p_values(values, covariances, population.kept)
         belongs = p_values >= min(LEVEL / count, float(np.median(p_values)))
@@ -453,12 +452,12 @@ def _names(units: _Units) -> list[str]:
 # --- what stands out --------------------------------------------------------------------------------------------------
 
 
-def _strangers(path: Path, gyroscope: bool, population: Population, asked: _Units, shifts: Shifts, total: int):
+def _strangers(path: Path, gyroscope: bool, population: Population, sample: _Units, shifts: Shifts, total: int):
     """Units farther from the population, or from their lot and date, than one in a hundred fleets would have.
 
-    asked: the units that the population was estimated from.
+    sample: the units that the population was estimated from.
     """
-    members = {(row["device"], row["file"]) for row, kept in zip(asked.rows, population.kept, strict=True) if kept}
+    members = {(row["device"], row["file"]) for row, kept in zip(sample.rows, population.kept, strict=True) if kept}
     strangers = []
     for rows in _groups(path, gyroscope):
         units = _units(rows, gyroscope)
