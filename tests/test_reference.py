@@ -321,7 +321,7 @@ def test_files_of_references(tmp_path):
         tmp_path / "e.csv", "time [ms],roll [deg],pitch [deg],yaw [deg]",
         [1e3 * time, np.degrees(rotation.as_euler("ZYX")[:, ::-1])],
     )  # fmt: skip
-    vectors = written(tmp_path / "f.csv", "time [s],rotvec_x,rotvec_y,rotvec_z", [time, rotation.as_rotvec()])
+    vectors = written(tmp_path / "f.csv", "timestamp_us,rotvec_x,rotvec_y,rotvec_z", [1e6 * time, rotation.as_rotvec()])
     angles = np.degrees(rotation.as_euler("XYZ"))
     gimbals = written(
         tmp_path / "k.csv", "time [s],table_angle_x [deg],table_angle_y [deg],table_angle_z [deg]", [time, angles]

@@ -14,6 +14,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import FilePath, InputError
 from jaximu.ground.units import parse_column, unit
 from jaximu.recordings.attitude import Attitude
+from jaximu.recordings.columns.habits import Field
 from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.readers.reader import read_tables
 
@@ -168,7 +169,7 @@ def _time(table: LogTable, places: _Places, name: str, notes: list[str]) -> tupl
         return np.arange(len(table.columns[0])) / table.rate, 0.0
     at = places["time"][""]
     stamps = table.numbers(at)
-    stated = parse_column(table.header[at])[1]
+    stated = parse_column(table.header[at])[1] or Field.of(table.header[at]).unit
     if stated is None:
         factor, unit_name = next(
             ((factor, unit_name) for least, factor, unit_name in _EPOCHS if stamps[0] > least), (1.0, "s")
