@@ -90,6 +90,11 @@ class Population:
         """Standard deviations (p,) between units, the noise of their estimates taken off."""
         return sigmas_of(self.covariance)
 
+    @property
+    def farthest(self) -> float:
+        """Standard deviations by which a unit may be off in one parameter before it stands out."""
+        return float(scipy.stats.t.isf(LEVEL / (4 * len(self.names) * self.count), self.count - 2))
+
     def shrink(self, values: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the posterior means (n, p) and covariances (n, p, p) of estimates (n, p) with theirs (n, p, p)."""
         total = self.covariance + covariances

@@ -84,11 +84,13 @@ def page_of(fleet: Fleet, magnetometers: Sequence[str] = (), stated: str = "") -
 def _verdict(fleet: Fleet) -> Iterator[str]:
     failed = fleet.recordings - fleet.statuses["ok"]
     yield f"{counted(failed, 'recording')} could not be calibrated." if failed else "All recordings were calibrated."
-    if fleet.population is None:
+    population = fleet.population
+    if population is None:
         yield "Too few units to speak of a population."
         return
     devices = [stranger.device for stranger in fleet.strangers]
-    yield f"{counted(len(devices), 'outlier')}: {_first(devices, 3)}." if devices else "No outliers."
+    limit = f"of {population.count} units one stands out beyond {population.farthest:.2g} times their spread"
+    yield f"{counted(len(devices), 'outlier')}: {_first(devices, 3)}." if devices else f"No outliers: {limit}."
     groups = [f"{difference.kind} {difference.group}" for difference in fleet.differences if difference.kind != "date"]
     if groups := [*dict.fromkeys(groups)]:
         yield f"Different from the rest: {_first(groups, 3)}."
