@@ -18,7 +18,7 @@ from jaximu.estimation.fitting import effect_numbers
 from jaximu.model.effects import CATALOGUE
 from jaximu.recordings import write_recording
 from jaximu.recordings.attitude import Attitude
-from jaximu.recordings.readers import holds_attitude, read_attitude
+from jaximu.recordings.readers import holds_attitude, read_attitude, read_reference
 from jaximu.recordings.recording import Signal
 from jaximu.report.attitude import mounting_words
 
@@ -341,6 +341,30 @@ def test_files_of_references(tmp_path):
         read_attitude(written(tmp_path / "h.csv", "time [s],a,b,c", [time, p]))
     with pytest.raises(InputError, match="no time column"):
         read_attitude(written(tmp_path / "i.csv", "qw,qx,qy,qz", [q]))
+
+
+@pytest.mark.parametrize(
+    ("title", "factor"),
+    [("timestamp_ms", 1e3), ("time_us", 1e6), ("t_ns", 1e9), ("timestampNs", 1e9), ("millis", 1e3),
+     ("mocap_time_ms", 1e3), ("tow_s", 1.0), ("ros_time", 1.0)],
+)  # fmt: skip
+def test_stamps_of_references_are_in_the_unit_that_their_name_says(title, factor, tmp_path):
+    made = moved()
+    path = written(tmp_path / "a.csv", f"{title},qw,qx,qy,qz", [np.round(made.stamp * factor, 3), made.quaternion])
+    found = read_attitude(path)
+    np.testing.assert_allclose(found.start + found.time, made.stamp, atol=1e-3)
+    assert any("state no unit" in note for note in found.notes) == (title == "ros_time")
+
+
+def test_seconds_and_nanoseconds_of_references_are_one_time(tmp_path):
+    made = moved()
+    whole, rest = np.divmod(np.round(made.stamp * 1e9), 1e9)
+    path = tmp_path / "a.csv"
+    rows = [f"{s:.0f},{n:.0f}," + ",".join(map(str, q)) for s, n, q in zip(whole, rest, made.quaternion, strict=True)]
+    path.write_text("\n".join(["sec,nanosec,attitude_w,attitude_x,attitude_y,attitude_z", *rows]), encoding="utf-8")
+    attitude, columns = read_attitude(path), read_reference(path, unit_of(made)).attitude
+    np.testing.assert_allclose(attitude.start + attitude.time, made.stamp, atol=1e-6)
+    np.testing.assert_allclose(columns.time, made.stamp, atol=1e-6)
 
 
 def test_angles_of_a_table_of_two_axes_are_an_attitude_and_that_of_one_is_not(tmp_path):

@@ -14,12 +14,14 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import FilePath, InputError
 from jaximu.ground.units import parse_column, unit
 from jaximu.recordings.attitude import Attitude
-from jaximu.recordings.columns.habits import Field
+from jaximu.recordings.columns.habits import fields_of, last_of
+from jaximu.recordings.columns.known import whole_stamps
+from jaximu.recordings.columns.names import TIME, header_columns
 from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.readers.reader import read_tables
 
 _HABITS = {
-    "time": (r".*(?:time|stamp).*|t|sec(?:onds)?",),
+    "time": (r".*(?:time|stamp).*",),
     "quaternion": (
         r".*(?:attitude|quat(?:ernion)?|orientation|rotation)_?([wxyz])",
         r"(?:.*_)?q(?:_[a-z]+)?_?([wxyz])",
@@ -75,7 +77,7 @@ def holds_attitude(path: FilePath) -> bool:
 
 def _tables(path: FilePath) -> list[tuple[LogTable, _Places]]:
     """Return the tables of a file that hold an attitude, and where their columns are."""
-    tables = [(table, _places(table)) for table in map(_named, read_tables(path))]
+    tables = [(table, _places(table)) for table in map(_named, map(whole_stamps, read_tables(path)))]
     kinds = {"quaternion", "numbered", "euler", "rotation vector", "table angles"}
     return [(table, places) for table, places in tables if kinds & set(places)]
 
@@ -99,6 +101,9 @@ def _places(table: LogTable) -> _Places:
                 axis = match.group(1) if match.groups() else ""
                 kinds.setdefault(kind, {}).setdefault({"e": "x", "n": "y", "u": "z"}.get(axis, axis), at)
                 break
+    for at, column in enumerate(header_columns(table) or ()):
+        if column.name == TIME:
+            kinds["time"] = {"": at}
     complete = {"time": {""}, "quaternion": set("wxyz"), "numbered": set("0123"), "euler": {"roll", "pitch", "yaw"}}
 
     def whole(kind: str, axes: dict[str, int]) -> bool:
@@ -169,7 +174,7 @@ def _time(table: LogTable, places: _Places, name: str, notes: list[str]) -> tupl
         return np.arange(len(table.columns[0])) / table.rate, 0.0
     at = places["time"][""]
     stamps = table.numbers(at)
-    stated = parse_column(table.header[at])[1] or Field.of(table.header[at]).unit
+    stated = fields_of(table.header)[at].unit or last_of(table.header[at])[1]
     if stated is None:
         factor, unit_name = next(
             ((factor, unit_name) for least, factor, unit_name in _EPOCHS if stamps[0] > least), (1.0, "s")

@@ -21,6 +21,7 @@ import numpy as np
 from jaximu.ground.errors import FilePath, InputError, readable
 from jaximu.ground.units import parse_column, unit
 from jaximu.recordings.attitude import UNIT_LENGTH
+from jaximu.recordings.columns.known import whole_stamps
 from jaximu.recordings.columns.names import GROUPS, header_columns
 from jaximu.recordings.entry import ScheduleEntry
 from jaximu.recordings.readers.reader import extract, read_table
@@ -50,7 +51,7 @@ def read_reference(path: FilePath, recording: Recording) -> tuple[ScheduleEntry,
     if "part" in header:
         sections = _marked_sections(text, header.index("part"), name, len(recording.accelerometer))
         return _sections(sections, name, recording)
-    table = read_table(name)
+    table = whole_stamps(read_table(name))
     columns = header_columns(table) or ()
     groups = {group for group in _REFERENCES if any(c.name in GROUPS[group].columns for c in columns)}
     if not groups:
