@@ -18,6 +18,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.mistakes import prepare
 from jaximu.model.effects import CATALOGUE
 from jaximu.recordings import write_recording
+from jaximu.recordings.readers import ReadOptions, read_magnetometer
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.report.magnetometer import next_words, page_of, statements
 
@@ -364,6 +365,22 @@ def test_other_verbs_take_what_is_theirs(calibrations, cases, tmp_path, capsys):
     capsys.readouterr()
     assert main(["plan", str(tmp_path / "calibration.json")]) == 0
     assert "Magnetometer: more orientations buy little" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("G", 0.01), ("nT", 1e3), ("uT", 1.0)])
+@pytest.mark.parametrize("named", [True, False])
+def test_the_line_to_paste_keeps_a_magnetometer_with_hard_iron_and_no_unit(unit, factor, named, cases, tmp_path):
+    case, path = cases[0], tmp_path / "log.csv"
+    inertial = [case.recording.signals[name].values[::4] for name in ("accelerometer", "gyroscope")]
+    field = (case.magnetometer.values + [60.0, 0.0, -20.0]) * factor
+    header = ",".join(["t", *(f"{sensor}_{axis}" for sensor in ("acc", "gyr", "mag") for axis in "xyz")])
+    columns = np.column_stack([case.magnetometer.time, *inertial, field])
+    np.savetxt(path, columns, "%.6f", ",", header=header if named else "", comments="")
+    with pytest.raises(InputError) as refusal:
+        read_magnetometer(path)
+    line = str(refusal.value).split('"')[1]
+    assert line == f"time [s],accel [m/s^2],gyro [rad/s],mag [{unit}]"
+    assert len(read_magnetometer(path, ReadOptions(columns=line))[0]) == len(field)
 
 
 def test_what_cannot_be_calibrated_is_a_sentence(cases):

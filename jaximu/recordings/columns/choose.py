@@ -81,7 +81,7 @@ def _unnamed(table: LogTable, sensor: str, option: str) -> InputError:
         )
     else:
         text = f"{table.path}: has no column names ({len(table.columns)} columns). Name them all"
-    advice = advise(table, "gyro" if sensor == "gyro" else None)
+    advice = advise(table, None if sensor == "accel" else sensor)
     if not (advice.line(option) or advice.questions):  # the header names all that it has
         file = f"; a separate file is given with --{sensor}-log" if sensor != "accel" else ""
         return InputError(f"{text} in order with {option}{file}.")

@@ -44,6 +44,7 @@ from jaximu.recordings.recording import FASTEST, SLOWEST, Signal, likeliest
 ASSUMED_RATE = 100.0  # Hz, of a log that does not say it
 
 _GRAVITY_IN = {name: STANDARD_GRAVITY / unit_named(name).factor for name in ("m/s^2", "g", "mg", "cm/s^2")}
+_FIELD_IN = {name: 40.0 / unit_named(name).factor for name in ("uT", "G", "mG", "nT", "T")}
 _PLAUSIBLE = 0.5, 8000.0
 _LIKELY = 5.0, 4000.0
 """Hz: sample rates that a log may have, stamps that mean another are in another unit; and that one with turns has."""
@@ -69,7 +70,7 @@ _UNIT_LENGTH = 2e-3  # that the norm of a quaternion may be off by, as few digit
 _ATTITUDES = {"q", "quat", "quaternion", "orientation", "attitude"}
 _ROUGH = 0.15  # logarithm by which turns may be off what a gyroscope's scale makes of them
 _TURNING = 5.0  # times the scatter in them by which means of a gyroscope at rest do not differ
-_ANOTHER = math.log(2.0)  # logarithm by which a level at rest must miss 1 g for its unit to be another
+_ANOTHER = math.log(2.0)  # logarithm by which a level must miss 1 g or the Earth's field for its unit to be another
 _COPY = 0.99  # share of an accelerometer's variance that its own values in another unit explain
 _HOTTEST = 125.0  # °C that a sensor survives
 _KELVIN, _EITHER = (
@@ -323,6 +324,11 @@ class _Guess:
         if accel is not None and gyro is None:
             gyro = self._by_turning(free, accel)
         self._units(accel, gyro)
+        if self.role == "mag" and all(triad.sensor != "mag" for triad in triads):
+            rest = [triad for triad in free if self.chosen.keys().isdisjoint(triad.places)]
+            if triad := self._only(rest, self.role):
+                triad.sensor = self.role
+                triads.append(triad)
         self._others(triads)
         return self._result(accel, gyro)
 
@@ -832,11 +838,13 @@ class _Guess:
         """Magnetometer and temperature, where name and unit are clear; what is not clear is left out."""
         for triad in triads:
             if triad.sensor == "mag" and not self._unit_of("mag_x"):
-                units = ("uT", "G", "mG", "nT", "T")  # in which it may be the Earth's field
-                fitting = [name for name in units if 25 < triad.level * unit_named(name).factor < 70]
                 unit = "count" if triad.whole and not triad.unit else _fitting(triad.unit, "mag")
-                if unit or fitting:
-                    self._take(triad, "mag", unit or fitting[0])
+                nearest, off = likeliest(triad.level or 1.0, _FIELD_IN)
+                if unit is None and (self.role == "mag" or off < _ANOTHER):
+                    unit = nearest
+                    self.reasons.append(f"{triad.label!r} reads {triad.level:.3g}, near the Earth's field in {unit}")
+                if unit:
+                    self._take(triad, "mag", unit)
         for sensor, at in self.clocks.items():
             if self.time is not None and self._unit_of(f"{sensor}_x"):
                 self.chosen[at] = Column(f"{sensor}_time", self.fields[at].unit or self.chosen[self.time].unit)

@@ -583,7 +583,8 @@ def extract(
         else Column(None)
         for column, title in zip(columns, table.header, strict=True)
     ]
-    used = column_units(table, wanted, option, "gyro" if option == "--gyro-columns" else None)
+    sensor = "gyro" if option == "--gyro-columns" else "mag" if groups == {"mag"} else None
+    used = column_units(table, wanted, option, sensor)
     for put_right in (
         (_stamped, _set_forward, _carried_on, _ordered if table.messages else _rising) if TIME in used else ()
     ):
