@@ -383,6 +383,16 @@ def test_the_line_to_paste_keeps_a_magnetometer_with_hard_iron_and_no_unit(unit,
     assert len(read_magnetometer(path, ReadOptions(columns=line))[0]) == len(field)
 
 
+@pytest.mark.parametrize("verb", ["magnetometer", "calibrate", "info"])
+def test_of_a_magnetometer_alone_nothing_is_to_be_answered_first(verb, cases, tmp_path, capsys):
+    path = tmp_path / "log.csv"
+    np.savetxt(path, np.round(30 * cases[0].magnetometer.values), "%.0f", ",", header="mx,my,mz", comments="")
+    assert main([verb, str(path)]) == 2
+    message = capsys.readouterr().err
+    assert f"This file holds a magnetometer alone: jaximu magnetometer {path} --columns 'mag [count]'" in message
+    assert "Answer first" not in message and "guess" not in message
+
+
 def test_what_cannot_be_calibrated_is_a_sentence(cases):
     time = np.arange(0, 30, 0.02)
     still = np.array([20.0, 5.0, -40.0]) + 0.1 * np.random.default_rng(0).standard_normal((len(time), 3))

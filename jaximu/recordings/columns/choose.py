@@ -27,15 +27,15 @@ def column_units(table: LogTable, columns: Sequence[Column], option: str, sensor
             first = table.label(used[column.name][0])
             raise table.refused(
                 f"the columns {first} and {table.label(index)} are both {column.name}; "
-                "ignore one of them (of two units on one body jaximu array takes both lists, with a ; between): "
-                f"{advise(table).sentence(option)}"
+                "ignore one of them (of two units on one body jaximu array takes both lists, with a ; between)"
+                f"{advise(table).sentence(option, ': ')}"
             )
         wanted = QUANTITIES[column.name]
         stated = column.unit or ("1" if wanted == ("ratio",) else None)
         if stated is None:
             raise table.refused(
-                f"column {table.label(index)} states no unit. State the units with {option}, after "
-                f"checking those guessed here: {advise(table, sensor).sentence(option)}"
+                f"column {table.label(index)} states no unit. State the units with {option}"
+                f"{advise(table, sensor).sentence(option, ', after checking those guessed here: ')}"
             )
         used[column.name] = index, unit(stated, wanted, file=table.path, column=column.name)
     for group in GROUPS.values():
@@ -66,7 +66,7 @@ def choose_columns(
 def _wrong_count(table: LogTable, count: int, option: str) -> InputError:
     return table.refused(
         f"{option} names {count} columns, the file has {len(table.columns)}; "
-        f"name each one, for example {advise(table).sentence(option)}"
+        f"name each one{advise(table).sentence(option, ', for example ')}"
     )
 
 
@@ -85,8 +85,8 @@ def _unnamed(table: LogTable, sensor: str, option: str) -> InputError:
     if not (advice.line(option) or advice.questions):  # the header names all that it has
         file = f"; a separate file is given with --{sensor}-log" if sensor != "accel" else ""
         return InputError(f"{text} in order with {option}{file}.")
-    guess = advice.sentence(option)
-    return InputError(f"{text} in order with {option}, after checking order and units of this guess: {guess}")
+    guess = advice.sentence(option, ", after checking order and units of this guess: ")
+    return InputError(f"{text} in order with {option}{guess}")
 
 
 def choose_pair(

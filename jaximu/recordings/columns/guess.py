@@ -138,12 +138,13 @@ class Advice:
             if value
         )
 
-    def sentence(self, option: str = "--columns") -> str:
-        """The line, what is asked, and why, in one line of text."""
-        questions = f" Answer first: {' '.join(question.text for question in self.questions)}" if self.questions else ""
+    def sentence(self, option: str = "--columns", lead: str = "") -> str:
+        """The line behind what leads to it, what is asked, and why, in one line of text; no lead without a line."""
+        questions = " ".join(question.text for question in self.questions)
         why = f" Why: {'; '.join(self.reasons)}." if self.reasons else ""
-        line = self.line(option)
-        return f"{line}.{questions}{why}" if line else f"{questions}{why}".strip()
+        if line := self.line(option):
+            return f"{lead}{line}.{questions and ' Answer first: '}{questions}{why}"
+        return f"{lead and '. '}{questions}{why}"
 
 
 @dataclass(eq=False)
