@@ -44,7 +44,6 @@ from jaximu.recordings.recording import FASTEST, SLOWEST, Signal, likeliest
 ASSUMED_RATE = 100.0  # Hz, of a log that does not say it
 
 _GRAVITY_IN = {name: STANDARD_GRAVITY / unit_named(name).factor for name in ("m/s^2", "g", "mg", "cm/s^2")}
-_FIELD_IN = {name: 40.0 / unit_named(name).factor for name in ("uT", "G", "mG", "nT", "T")}
 _PLAUSIBLE = 0.5, 8000.0
 _LIKELY = 5.0, 4000.0
 """Hz: sample rates that a log may have, stamps that mean another are in another unit; and that one with turns has."""
@@ -840,7 +839,8 @@ class _Guess:
         for triad in triads:
             if triad.sensor == "mag" and not self._unit_of("mag_x"):
                 unit = "count" if triad.whole and not triad.unit else _fitting(triad.unit, "mag")
-                nearest, off = likeliest(triad.level or 1.0, _FIELD_IN)
+                field_in = {name: 40.0 / unit_named(name).factor for name in ("uT", "G", "mG", "nT", "T")}
+                nearest, off = likeliest(triad.level or 1.0, field_in)  # the Earth's field is 22 to 67 uT
                 if unit is None and (self.role == "mag" or off < _ANOTHER):
                     unit = nearest
                     self.reasons.append(f"{triad.label!r} reads {triad.level:.3g}, near the Earth's field in {unit}")
