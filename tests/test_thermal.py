@@ -545,6 +545,17 @@ def test_start_up_rows_are_dropped_and_a_later_knock_is_not(one_way):
     assert without_startup(one_way) is one_way
 
 
+def test_the_first_of_coarse_steps_is_no_start_up(one_way):
+    """Of a thermometer with steps of half a degree 65 rows were "far off what follows"."""
+    steps = {"accelerometer": 0.02, "temperature": 0.5}
+    signals = {name: getattr(one_way, name) for name in steps}
+    rounded = {
+        name: replace(each, values=steps[name] * np.round(each.values / steps[name])) for name, each in signals.items()
+    }
+    coarse = replace(one_way, **rounded)
+    assert without_startup(coarse) is coarse
+
+
 def test_blocks_in_which_the_unit_moved_are_left_out(one_way):
     values = one_way.accelerometer.values.copy()
     values[1000:1050] += np.random.default_rng(0).normal(0, 3.0, (50, 3))

@@ -23,7 +23,7 @@ from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.processes import RATIO, correlation_times
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.columns.names import COUNTS_ADVICE
-from jaximu.recordings.recording import Recording, Signal, recordings_of, same_outputs, smoothed_slope
+from jaximu.recordings.recording import Recording, Signal, recordings_of, same_outputs, smoothed_slope, steps_of
 from jaximu.recordings.thermometer import course
 
 LEAST_RANGE = 3.0
@@ -478,7 +478,7 @@ def without_startup(recording: Recording) -> Recording:
     """Return the recording without the rows at its start that are far off what follows, and say so in its notes.
 
     A row is far off where some channel misses the straight line through the twelve rows after it by ten times the
-    usual miss.
+    usual miss, and by ten of the channel's own steps.
     """
     signals = [recording.accelerometer, recording.gyroscope, recording.temperature]
     if not (first := max(_startup(signal) for signal in signals if signal is not None)):
@@ -504,7 +504,8 @@ def _startup(signal: Signal) -> int:
     weights = 1 / ahead - (x - x.mean()) * x.mean() / ((x - x.mean()) ** 2).sum()
     windows = np.lib.stride_tricks.sliding_window_view(values[1:], ahead, axis=0)  # (count, axes, ahead)
     miss = abs(values[:count] - windows[:count] @ weights)
-    bad = np.flatnonzero((miss > _STARTUP * np.maximum(robust_sigma(miss, axis=0), 1e-12)).any(axis=1))
+    coarse = [steps_of(axis).min(initial=np.inf) for axis in signal.values.T]  # whose rows mostly miss nothing
+    bad = np.flatnonzero((miss > _STARTUP * np.maximum(robust_sigma(miss, axis=0), coarse)).any(axis=1))
     end = 0
     for row in bad:
         if row >= end + _SOONEST:
