@@ -1,6 +1,7 @@
 """What a cause at its detection limit would do: against recordings in which it is hidden, of the same noise."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import jaximu
 from jaximu.cli import main
 from jaximu.diagnosis.diagnosis import recorded_by_hand
 from jaximu.diagnosis.experiment import Experiment
-from jaximu.diagnosis.hidden import hidden_causes, shift_by
+from jaximu.diagnosis.hidden import _weakest, hidden_causes, shift_by
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.simulation import consumer_noise, draw_imu, simulate
@@ -105,3 +106,14 @@ def test_accept_allows_for_what_the_recording_cannot_see(sound, tmp_path, capsys
     del document["hidden"]
     (tmp_path / "diagnosis.json").write_text(json.dumps(document), encoding="utf-8")
     assert main(["accept", file, "--limits", limits, "--diagnosis", diagnosis]) == 2
+
+
+def test_of_combinations_that_nothing_shows_the_first_is_named():
+    """Which one a factorisation came upon first was chance: pages differed from machine to machine."""
+    block, random = SimpleNamespace(name="effect", sizes=np.ones(3)), np.random.default_rng(1)
+    for rounding in 1e-17 * random.standard_normal((20, 3, 3)):
+        information = np.diag([0.0, 1.0, 0.0]) + rounding + rounding.T
+        evidence = SimpleNamespace(blocks=[block], information=lambda _, shown=information: shown)
+        weights, limit = _weakest(evidence, "effect", 1.0)
+        assert limit == np.inf
+        np.testing.assert_allclose(weights, [1.0, 0.0, 0.0], atol=1e-9)

@@ -84,8 +84,12 @@ def _weakest(evidence: Evidence, name: str, limit: float) -> tuple[FloatArray, f
         if block.name == name
     ]
     values, vectors = np.linalg.eigh(max(informations, key=np.trace))
-    weights = vectors[:, 0] * np.sign(vectors[np.argmax(np.abs(vectors[:, 0])), 0])
     shows = values[0] > BLIND**2 * values[-1]
+    # of several that nothing shows, the one nearest the first axis that is none of the others
+    least = vectors[:, :1] if shows else vectors[:, values <= BLIND**2 * values[-1]]
+    alike = least @ least.T
+    weights = alike[:, np.argmax(np.diagonal(alike).round(6))]
+    weights = weights / np.linalg.norm(weights)
     return weights, float(limit * np.sqrt(values.mean() / values[0])) if shows else float("inf")
 
 
